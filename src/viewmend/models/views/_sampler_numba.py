@@ -17,7 +17,8 @@ inlined = kernel(cache=False, inline="always")  # passing many arrays takes as l
 def halve(image, half):
     """Rounded means of 2 x 2 pixels; images (row, column, channel) have a border of one black pixel."""
     rows, columns, channels = half.shape
-    last_row, last_column = image.shape[0] - 1, image.shape[1] - 1
+    last_row = image.shape[0] - 1
+    last_column = image.shape[1] - 1
     for row in range(1, rows - 1):
         top = 2 * row - 1
         below = min(top + 1, last_row)
@@ -48,7 +49,8 @@ def premultiply(rgb, mask, depth, out):
 @kernel
 def average_boxes(image, first, step, side, out):
     """Means of channels from `first` on over boxes of `side` x `side` pixels, of every `step`-th row and column."""
-    height, width = image.shape[0] - 1, image.shape[1] - 1
+    height = image.shape[0] - 1
+    width = image.shape[1] - 1
     boxes_down, boxes_across, channels = out.shape
     for box_row in range(1, boxes_down - 1):
         top = 1 + (box_row - 1) * side * step
@@ -70,14 +72,17 @@ def _project(per_metre, start, t, size):
     z = per_metre[2] * t + start[2]
     if not (t > 0 and z > 1e-6):
         return 0.0, 0.0, 0.0, False
-    u, v = (per_metre[0] * t + start[0]) / z, (per_metre[1] * t + start[1]) / z
+    u = (per_metre[0] * t + start[0]) / z
+    v = (per_metre[1] * t + start[1]) / z
     return u, v, z, u >= 0 and v >= 0 and u < size[0] and v < size[1]
 
 
 @inlined
 def _cosine(offset, direction, t):
     """Cosine of the angle at a sample between the ray and the camera, which is `offset` from the viewer."""
-    x, y, z = offset[0] - t * direction[0], offset[1] - t * direction[1], offset[2] - t * direction[2]
+    x = offset[0] - t * direction[0]
+    y = offset[1] - t * direction[1]
+    z = offset[2] - t * direction[2]
     along = x * direction[0] + y * direction[1] + z * direction[2]
     squares = direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]
     return -along / max(sqrt((x * x + y * y + z * z) * squares), 1e-12)
@@ -86,10 +91,16 @@ def _cosine(offset, direction, t):
 @inlined
 def _sample(image, u, v, scale, out, ray, sample, view, first, count):
     """The first `count` channels of an image with a border, bilinearly, in [0, 1], as channels from `first` on."""
-    x, y = u * scale + 0.5, v * scale + 0.5
-    left, top = min(floor(x), image.shape[1] - 2), min(floor(y), image.shape[0] - 2)
-    right, below = x - left, y - top
-    w00, w01, w10, w11 = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
+    x = u * scale + 0.5
+    y = v * scale + 0.5
+    left = min(floor(x), image.shape[1] - 2)
+    top = min(floor(y), image.shape[0] - 2)
+    right = x - left
+    below = y - top
+    w00 = (1 - right) * (1 - below)
+    w01 = right * (1 - below)
+    w10 = (1 - right) * below
+    w11 = right * below
     for c in range(count):
         out[ray, sample, view, first + c] = (1 / 255) * (
             w00 * image[top, left, c]
@@ -102,7 +113,8 @@ def _sample(image, u, v, scale, out, ray, sample, view, first, count):
 @inlined
 def _catmull_rom(t):
     """Weights of the four values around a position `t` of the way from the second to the third."""
-    a, d = t * (t * (1 - 0.5 * t) - 0.5), 0.5 * t * t * (t - 1)
+    a = t * (t * (1 - 0.5 * t) - 0.5)
+    d = 0.5 * t * t * (t - 1)
     b = t * t * (1.5 * t - 2.5) + 1
     return a, b, 1 - a - b - d, d
 
@@ -110,10 +122,14 @@ def _catmull_rom(t):
 @inlined
 def _sample_cubic(image, u, v, scale, out, ray, sample, view, first, count):
     """`_sample` by Catmull-Rom splines, clamped to [0, 1]."""
-    x, y = u * scale + 0.5, v * scale + 0.5
-    left, top = floor(x), floor(y)
-    across, down = _catmull_rom(x - left), _catmull_rom(y - top)
-    last_row, last_column = image.shape[0] - 1, image.shape[1] - 1
+    x = u * scale + 0.5
+    y = v * scale + 0.5
+    left = floor(x)
+    top = floor(y)
+    across = _catmull_rom(x - left)
+    down = _catmull_rom(y - top)
+    last_row = image.shape[0] - 1
+    last_column = image.shape[1] - 1
     for c in range(count):
         total = 0.0
         for i in range(4):
@@ -126,9 +142,12 @@ def _sample_cubic(image, u, v, scale, out, ray, sample, view, first, count):
 @inlined
 def _covered_depth(depth, u, v):
     """Bilinear share of the pixels that have a depth, and the mean of their depths times it."""
-    left, top = floor(u - 0.5), floor(v - 0.5)
-    right, below = u - 0.5 - left, v - 0.5 - top
-    share, total = 0.0, 0.0
+    left = floor(u - 0.5)
+    top = floor(v - 0.5)
+    right = u - 0.5 - left
+    below = v - 0.5 - top
+    share = 0.0
+    total = 0.0
     for row in range(max(0, top), min(depth.shape[0], top + 2)):
         for column in range(max(0, left), min(depth.shape[1], left + 2)):
             if depth[row, column] > 0:
@@ -141,15 +160,16 @@ def _covered_depth(depth, u, v):
 @kernel
 def sample_camera(
     first, end, view, z, directions, per_metre, start, offset, size, images, scales, depth, size_m, is_source,
-    least_share, cubic, out, prior,
+    min_coverage, cubic, out, prior,
 ):  # fmt: skip
     """`CameraFeatures` of the samples on rays first to end - 1 in one camera, and prior weights, not normalised.
 
-    `cubic` applies to colour and mask. With a `least_share` above 0, distances behind the proxy are those of `RayFill`,
-    and there are no prior weights.
+    `cubic` applies to colour and mask. With a `min_coverage` above 0, distances behind the proxy are those of
+    `RayFill`, and there are no prior weights.
     """
     fine, wide, shapes = images
-    per_near, per_far = 1 / (NEAR * size_m), 1 / (FAR * size_m)
+    per_near = 1 / (NEAR * size_m)
+    per_far = 1 / (FAR * size_m)
     extent = np.float32(size[0]), np.float32(size[1])
     for ray in range(first, end):
         for sample in range(z.shape[1]):
@@ -166,16 +186,17 @@ def sample_camera(
                 _sample(fine, u, v, scales[0], out, ray, sample, view, 0, 4)
             _sample(wide, u, v, scales[1], out, ray, sample, view, 9, wide.shape[2])
             cosine = _cosine(offset, directions[ray], t)
-            if least_share > 0:
+            if min_coverage > 0:
                 _sample(shapes, u, v, scales[2], out, ray, sample, view, 12, 2)
                 share, total = _covered_depth(depth, u, v)
-                behind = w - total / share if share > least_share else 0.0
-                near, far = tanh(behind * per_near), tanh(behind * per_far)
+                behind = w - total / share if share > min_coverage else 0.0
+                near = tanh(behind * per_near)
+                far = tanh(behind * per_far)
             else:
                 surface = depth[min(int(v), size[1] - 1), min(int(u), size[0] - 1)]
                 behind = w - surface if surface > 0 else 0.0
-                near, far = behind * per_near, behind * per_far
-                near, far = near / (1 + abs(near)), far / (1 + abs(far))
+                near = behind * per_near / (1 + abs(behind * per_near))
+                far = behind * per_far / (1 + abs(behind * per_far))
                 prior[ray, sample, view] = exp(4 * cosine) / (1 + exp(6 * near))
             out[ray, sample, view, 4] = near
             out[ray, sample, view, 5] = far
@@ -197,9 +218,11 @@ def compare_cameras(first, end, features, prior, statistics):
                 prior[ray, sample, view] /= total
                 features[ray, sample, view, 17] = prior[ray, sample, view]
             for c in range(3):
-                mean, square = 0.0, 0.0
+                mean = 0.0
+                square = 0.0
                 for view in range(views):
-                    value, weight = features[ray, sample, view, c], prior[ray, sample, view]
+                    value = features[ray, sample, view, c]
+                    weight = prior[ray, sample, view]
                     mean += weight * value
                     square += weight * value * value
                 statistics[ray, sample, c] = mean
@@ -212,9 +235,12 @@ def compare_cameras(first, end, features, prior, statistics):
 @inlined
 def _sample_mask(image, u, v, scale):
     """The only channel of an image with a border, as `_sample`."""
-    x, y = u * scale + 0.5, v * scale + 0.5
-    left, top = min(floor(x), image.shape[1] - 2), min(floor(y), image.shape[0] - 2)
-    right, below = x - left, y - top
+    x = u * scale + 0.5
+    y = v * scale + 0.5
+    left = min(floor(x), image.shape[1] - 2)
+    top = min(floor(y), image.shape[0] - 2)
+    right = x - left
+    below = y - top
     upper = (1 - right) * image[top, left, 0] + right * image[top, left + 1, 0]
     lower = (1 - right) * image[top + 1, left, 0] + right * image[top + 1, left + 1, 0]
     return (1 / 255) * ((1 - below) * upper + below * lower)
@@ -224,7 +250,8 @@ def _sample_mask(image, u, v, scale):
 def _keep_smallest(smallest, ray, sample, first, value):
     """Inserts a value into the two smallest of a sample, in order."""
     if value < smallest[ray, sample, first]:
-        smallest[ray, sample, first + 1], smallest[ray, sample, first] = smallest[ray, sample, first], value
+        smallest[ray, sample, first + 1] = smallest[ray, sample, first]
+        smallest[ray, sample, first] = value
     elif value < smallest[ray, sample, first + 1]:
         smallest[ray, sample, first + 1] = value
 
@@ -245,15 +272,18 @@ def compare_silhouette(first, end, z, per_metre, start, size, images, scales, sm
 def aggregate(first, end, bias, features, statistics, prior, hidden, shared, weight, out, trust):
     """Softmax over the cameras that have a sample in view, and weighted sums over them, of rays first to end - 1."""
     _, samples, views, width = hidden.shape
-    count, channels = features.shape[3], statistics.shape[2]
+    count = features.shape[3]
+    channels = statistics.shape[2]
     for ray in range(first, end):
         for sample in range(samples):
-            row, shares = out[ray, sample], trust[ray, sample]
+            row = out[ray, sample]
+            shares = trust[ray, sample]
             most = np.float32(-1e30)
             for view in range(views):
                 if features[ray, sample, view, IN_VIEW] == 0:
                     continue
-                own, score = hidden[ray, sample, view], np.float32(bias)
+                own = hidden[ray, sample, view]
+                score = np.float32(bias)
                 for c in range(width):
                     own[c] = max(np.float32(0), own[c] + shared[ray, sample, c])
                     score += own[c] * weight[c]
@@ -264,7 +294,8 @@ def aggregate(first, end, bias, features, statistics, prior, hidden, shared, wei
                 if features[ray, sample, view, IN_VIEW] == 0:
                     shares[view] = np.float32(0)
                     continue
-                shares[view] = (prior[ray, sample, view] + np.float32(1e-3)) * np.float32(exp(shares[view] - most))
+                relative = np.float32(exp(shares[view] - most))
+                shares[view] = (prior[ray, sample, view] + np.float32(1e-3)) * relative
                 total += shares[view]
             certain = np.float32(0)
             for view in range(views):
@@ -273,7 +304,8 @@ def aggregate(first, end, bias, features, statistics, prior, hidden, shared, wei
                 share = shares[view] / total
                 shares[view] = share
                 certain += share * share
-                own, own_features = hidden[ray, sample, view], features[ray, sample, view]
+                own = hidden[ray, sample, view]
+                own_features = features[ray, sample, view]
                 for c in range(width):
                     row[c] += share * own[c]
                 for c in range(count):

@@ -12,7 +12,7 @@ from viewmend.models.views.config import COLOUR, CONTRAST, FEATURES, IN_VIEW, MA
 from viewmend.models.views.sampler import RaySamples
 
 BAND = 64
-"""Rays that a thread takes at a time."""
+"""A thread aggregates this many rays at a time."""
 
 
 class AggregatedSamples(NamedTuple):
@@ -38,18 +38,28 @@ class SampleAggregator(nn.Module):
         self.all_cameras = nn.Linear(STATISTICS, width)
         self.trust = nn.Linear(width, 1)
         inputs = width + FEATURES + 3 + STATISTICS + 1
-        self.sample = nn.Sequential(nn.Linear(inputs, 2 * width), nn.ReLU(), nn.Linear(2 * width, channels + 1))
+        self.sample = nn.Sequential(
+            nn.Linear(inputs, 2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, channels + 1),
+        )
 
     def forward(self, samples: RaySamples, prior: Float[Tensor, "ray sample view"] | None = None) -> AggregatedSamples:
         """The aggregated samples; `prior` replaces the initial weights of the cameras."""
-        features, statistics = samples.features, samples.statistics
-        prior = samples.prior if prior is None else prior
+        features = samples.features
+        statistics = samples.statistics
+        if prior is None:
+            prior = samples.prior
         if features.device.type == "cpu" and not torch.is_grad_enabled():
             return self._aggregate_numba(samples, prior)
+
+        # The trust in each camera
         hidden = F.relu(self.camera(features) + self.all_cameras(statistics)[:, :, None])
         score = self.trust(hidden)[..., 0].float() + (prior + 1e-3).log()
         inside = features[..., IN_VIEW]
         trust = inside * score.masked_fill(inside == 0, -1e4).softmax(2)
+
+        # What the trusted cameras show, and how much they agree
         summary = _weighted_sum(trust.to(hidden), hidden)
         with torch.autocast(features.device.type, enabled=False):  # colours need more than eight bits
             mean = _weighted_sum(trust, features)
@@ -67,15 +77,28 @@ class SampleAggregator(nn.Module):
         with torch.autocast("cpu", enabled=False), heavy_operations():
             hidden = samples.features @ self.camera.weight.T.float()
             shared = self.all_cameras(samples.statistics) + self.camera.bias.float()
-            weight, bias = self.trust.weight[0].float(), float(self.trust.bias)
+            weight = self.trust.weight[0].float()
+            bias = float(self.trust.bias)
             inputs = torch.zeros(count, per_ray, len(weight) + FEATURES + 3 + STATISTICS + 1)
             trust = torch.empty(count, per_ray, views)
-            tensors = (samples.features, samples.statistics, prior.contiguous(), hidden, shared, weight, inputs, trust)
-            arrays = [tensor.numpy() for tensor in tensors]
-            parallel_for(
-                lambda band: aggregate(band * BAND, min(count, (band + 1) * BAND), bias, *arrays), -(-count // BAND)
+            tensors = (
+                samples.features,
+                samples.statistics,
+                prior.contiguous(),
+                hidden,
+                shared,
+                weight,
+                inputs,
+                trust,
             )
-            out, mean = self.sample(inputs), inputs[..., len(weight) :]
+            arrays = [tensor.numpy() for tensor in tensors]
+
+            def work(band: int) -> None:
+                aggregate(band * BAND, min(count, (band + 1) * BAND), bias, *arrays)
+
+            parallel_for(work, -(-count // BAND))
+            out = self.sample(inputs)
+        mean = inputs[..., len(weight) :]
         return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
 
 
@@ -83,6 +106,7 @@ def _weighted_sum(
     trust: Float[Tensor, "ray sample view"], values: Float[Tensor, "ray sample view value"]
 ) -> Float[Tensor, "ray sample value"]:
     """Sums over cameras."""
-    rays, samples, views, channels = values.shape  # all named: there may be no rays
-    summed = torch.bmm(trust.reshape(rays * samples, 1, views), values.reshape(rays * samples, views, channels))
+    rays, samples, views, channels = values.shape  # -1 would be ambiguous without rays
+    weights = trust.reshape(rays * samples, 1, views)
+    summed = torch.bmm(weights, values.reshape(rays * samples, views, channels))
     return summed.view(rays, samples, channels)

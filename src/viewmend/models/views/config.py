@@ -8,19 +8,26 @@ from msgspec import Meta
 from viewmend.utils.untrusted_input import typed
 
 OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.19, 0.26, 0.36, 0.5)
-"""Depth hypotheses of a ray: z-depth behind the proxy, in subject sizes."""
+"""The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes."""
 FEATURES = 18
-"""Features of a ray sample in one camera: the 14 of `CameraFeatures`, RGB minus the cameras' mean, and prior weight."""
-COLOUR, MASK, IN_VIEW = slice(0, 3), slice(3, 4), 8
+"""A ray sample has this many features per camera: the 14 of `CameraFeatures`, RGB minus the cameras' mean, and the
+prior weight."""
+COLOUR = slice(0, 3)
+"""These features of a ray sample are the camera's RGB on black."""
+MASK = slice(3, 4)
+"""This feature of a ray sample is the camera's mask."""
+IN_VIEW = 8
+"""This feature of a ray sample is 1 if the camera has the sample in view, else 0."""
 STATISTICS = 10
-"""Statistics of a ray sample over cameras: mean RGB, variance of RGB, the two smallest masks of the rig, and the two
-smallest masks averaged around the sample."""
-NEAR, FAR = 0.03, 0.2
-"""Scales of the fine and the coarse distance behind the proxy, in subject sizes."""
+"""A ray sample has this many statistics over cameras; `RayStatistics` names them."""
+NEAR = 0.03
+"""The fine distance behind the proxy saturates at this scale, in subject sizes."""
+FAR = 0.2
+"""The coarse distance behind the proxy saturates at this scale, in subject sizes."""
 CONTRAST = 10.0
-"""Factor on variances of colours, which are small numbers."""
+"""Variances of colours are multiplied by this factor, because they are small numbers."""
 AROUND = 0.06
-"""Side of the squares over which images are averaged around a sample, in subject sizes."""
+"""Images are averaged around a sample over squares of this side, in subject sizes."""
 
 Size = Annotated[int, Meta(ge=1, le=1024)]
 
@@ -36,7 +43,8 @@ class Sizes:
     def from_dict(cls: Any, values: dict[str, Any]) -> Any:
         """Inverse of `to_dict`. Raises ValueError for an unknown key or an impossible value."""
         names = [field.name for field in fields(cls)]
-        if unknown := sorted(set(values) - set(names)):
+        unknown = sorted(set(values) - set(names))
+        if unknown:
             raise ValueError(f"expected keys among {names}, got {unknown}; use the version of viewmend that wrote them")
         return typed(values, cls)
 

@@ -26,29 +26,37 @@ from viewmend.models.views.sampler import Rays, sample_rays
 from viewmend.types import CompletedView, IncompleteView
 
 IMAGE_CHANNELS = 7
-"""RGB, M, whether a pixel is coloured, its largest source weight, and its depth in subject sizes."""
+"""A pixel has this many inputs: RGB, M, whether it is coloured, its largest source weight, and its relative depth."""
 DEEPEST = 2.0
 """Depths are clamped to this many subject sizes around the median."""
 BEHIND = (0.0, 0.012, 0.03, 0.06, 0.11, 0.2, 0.36)
-"""Samples on the rays of cells of 4 x 4 pixels: z-depth behind the proxy, in subject sizes."""
+"""Rays of cells of 4 x 4 pixels are sampled at these z-depths behind the proxy, in subject sizes."""
 BEHIND_CHANNELS = 24
-"""Features kept of these samples."""
+"""The network keeps this many features of the samples behind the proxy."""
 LARGE_PX = 128
-"""Root of the area from which on a subject is judged at half the resolution, if nothing is re-synthesised."""
+"""A subject is judged at half the resolution if nothing is re-synthesised and the root of its area is at least this,
+pixels."""
 
 
 def fallback_view(
-    view: IncompleteView, fades: Bool[Tensor, "height width"], fill: Float[Tensor, "3 height width"] | None = None
+    view: IncompleteView,
+    fades: Bool[Tensor, "height width"],
+    fill: Float[Tensor, "3 height width"] | None = None,
 ) -> CompletedView:
     """The view without a prediction: background is attenuated, and holes get `fill` with a confidence of 0."""
-    E, filled = view.error, view.holes if fill is not None else torch.zeros_like(view.holes)
-    rgb = view.rgb.new_zeros(view.rgb.shape) if fill is None else fill * filled
+    if fill is None:
+        filled = torch.zeros_like(view.holes)
+        rgb = torch.zeros_like(view.rgb)
+    else:
+        filled = view.holes
+        rgb = fill * filled
+    E = view.error
     return CompletedView(
         view,
-        blend(view.rgb, E, rgb, (fades | filled).to(E)),
-        torch.where(fades, (1 - E) * view.mask, view.mask),
-        torch.where(filled, (1 - E) * view.mask, view.mask),
-        view.depth,
+        rgb=blend(view.rgb, E, rgb, (fades | filled).to(E)),
+        alpha=torch.where(fades, (1 - E) * view.mask, view.mask),
+        confidence=torch.where(filled, (1 - E) * view.mask, view.mask),
+        depth=view.depth,
     )
 
 
@@ -58,36 +66,50 @@ class ErrorPredictor(Network):
     def __init__(self, features: int) -> None:
         """`features` is the number of channels at half the resolution."""
         super().__init__()
-        self.behind = nn.Sequential(nn.Linear(len(BEHIND) * STATISTICS, 32), nn.ReLU(), nn.Linear(32, BEHIND_CHANNELS))
+        self.behind = nn.Sequential(
+            nn.Linear(len(BEHIND) * STATISTICS, 32),
+            nn.ReLU(),
+            nn.Linear(32, BEHIND_CHANNELS),
+        )
         self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + STATISTICS + BEHIND_CHANNELS, features)
         self.head = nn.Conv2d(features, CELL_PX**2 * len(ErrorMap._fields), 1)
 
     def forward(self, view: IncompleteView, sources: SourceCameras, scale: SceneScale | None = None) -> ErrorMap:
         """Predicted errors of a view's pixels; its E is not used. For a crop, `scale` is that of the whole view."""
-        scale, depth = scale or SceneScale.of(view), rim_depth(view.depth)
-        height, width = depth.shape
-        depth = F.pad(depth, (0, -width % (2 * CELL_PX), 0, -height % (2 * CELL_PX)))
+        if scale is None:
+            scale = SceneScale.of(view)
+        height, width = view.depth.shape
+        right = -width % (2 * CELL_PX)
+        below = -height % (2 * CELL_PX)
+        depth = F.pad(rim_depth(view.depth), (0, right, 0, below))
         near = nearest_depth(depth)
-        relative = torch.where(depth > 0, ((depth - scale.depth_m) / scale.size_m).clamp(-DEEPEST, DEEPEST), 0.0)
+
+        # The rendered view: the pixels of each cell as channels
         coloured = (view.weights.sum(0) > 0).to(depth)
         image = torch.cat([view.rgb, torch.stack([view.mask, coloured, view.weights.amax(0)])])
-        image = F.pad(image, (0, depth.shape[1] - width, 0, depth.shape[0] - height))
-        inputs = [F.pixel_unshuffle(torch.cat([image, relative[None]]), CELL_PX)]
-        inputs.append(self._statistics(view, sources, scale, near, (0.0,), CELL_PX))
+        around_median = ((depth - scale.depth_m) / scale.size_m).clamp(-DEEPEST, DEEPEST)
+        relative = torch.where(depth > 0, around_median, 0.0)
+        pixels = torch.cat([F.pad(image, (0, right, 0, below)), relative[None]])
+
+        # Agreement of the cameras at the proxy, and in coarser cells behind it
+        at_proxy = self._statistics(view, sources, scale, near, (0.0,), CELL_PX)
         with self.autocast():
-            behind = self._statistics(view, sources, scale, nearest_depth(near), BEHIND, 2 * CELL_PX, self.behind)
-            inputs.append(F.interpolate(behind[None].float(), scale_factor=2, mode="nearest")[0])
-            out = self.head(self.unet(concatenate_channels(*inputs)))
-        out = F.pixel_shuffle(out.float().sigmoid(), CELL_PX)[0, :, :height, :width]
-        return ErrorMap(*torch.where(depth[:height, :width] > 0, out, 0.0))
+            coarse = nearest_depth(near)
+            behind = self._statistics(view, sources, scale, coarse, BEHIND, 2 * CELL_PX, self.behind)
+            behind = F.interpolate(behind[None].float(), scale_factor=2, mode="nearest")[0]
+            inputs = concatenate_channels(F.pixel_unshuffle(pixels, CELL_PX), at_proxy, behind)
+            logits = self.head(self.unet(inputs))
+        errors = F.pixel_shuffle(logits.float().sigmoid(), CELL_PX)[0, :, :height, :width]
+        return ErrorMap(*torch.where(depth[:height, :width] > 0, errors, 0.0))
 
     def predict(self, view: IncompleteView, sources: SourceCameras, quality: RenderQuality) -> ErrorMap:
         """Predicted errors of a whole view; of a large subject at half the resolution if nothing is re-synthesised."""
         if quality.refine_fraction != 0 or int((view.mask > 0).sum()) < LARGE_PX**2:
             return self(view, sources)
-        rim, small = rim_depth(view.depth) > 0, downsample2x(view)
+        small = downsample2x(view)
         errors = torch.stack(self(small, sources))
-        return ErrorMap(*torch.where(rim, upsample2x(errors, rim_depth(small.depth) > 0, view.mask.shape), 0.0))
+        upsampled = upsample2x(errors, rim_depth(small.depth) > 0, view.mask.shape)
+        return ErrorMap(*torch.where(rim_depth(view.depth) > 0, upsampled, 0.0))
 
     @staticmethod
     def _statistics(
@@ -104,4 +126,5 @@ class ErrorPredictor(Network):
         z = near[tuple(cells.T)][:, None] + scale.size_m * near.new_tensor(behind)
         rays = Rays(view, scale, cell_px * (cells.flip(1).double() + 0.5), z)
         statistics = sample_rays(rays, sources, float(cell_px)).statistics.flatten(1)
-        return scatter_to_image(statistics if layers is None else layers(statistics), cells, near.shape)
+        features = statistics if layers is None else layers(statistics)
+        return scatter_to_image(features, cells, near.shape)

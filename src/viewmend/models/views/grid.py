@@ -16,28 +16,29 @@ from viewmend.utils.cancellation import stop_if_cancelled
 Pixels = Int[Tensor, "pixel 2"]
 """Row and column of pixels."""
 CELL_PX = 2
-"""Side of the cells in which depth hypotheses are judged."""
+"""Depth hypotheses are judged in square cells of this side, pixels."""
 BEYOND_M = 1e30
-"""Farther than anything. Not infinite: ONNX Runtime's pooling turns infinity into its largest number."""
+"""Pixels without a depth count as this far away, metres: ONNX Runtime's pooling cannot handle infinity."""
 TILE_PX = 32
-"""Side of the tiles of `run_tiled`; a multiple of a cell's."""
+"""The tiles of `run_tiled` have this side, pixels; it is a multiple of a cell's."""
 AT_ONCE = (8, 4, 2, 1)
-"""Numbers of tiles that pass the layers together: few, since convolutions are compiled for each."""
+"""Tiles pass the layers in groups of these sizes: a few sizes, because convolutions are compiled for each."""
 BAND_PX = (3, 7)
-"""Sides of the squares whose means separate the bands of detail."""
+"""Means over squares of these sides, pixels, separate the bands of detail."""
 WIDER = 16
-"""Channels that the U-Net adds at each coarser scale."""
+"""The U-Net adds this many channels at each coarser scale."""
 
 
 def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """The depth, metres, extended by `RIM_PX` around the proxy with the smallest depth nearby; 0 elsewhere."""
     far = torch.where(depth > 0, depth, BEYOND_M)
     side = 2 * RIM_PX + 1
-    cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
-    if cpu and not torch.compiler.is_exporting():  # ten times as fast as PyTorch
+    on_cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
+    if on_cpu and not torch.compiler.is_exporting():  # ten times as fast as PyTorch
         import cv2
 
-        window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": BEYOND_M}
+        window = np.ones((side, side), np.uint8)
+        border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": BEYOND_M}
         near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
     else:
         near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
@@ -50,8 +51,10 @@ def downsample2x(view: IncompleteView) -> IncompleteView:
     All that the proxy covers becomes E.
     """
     height, width = view.mask.shape
-    right, below = width % 2, height % 2
-    camera = view.camera.cropped(0, 0, width + right, height + below).resized((width + 1) // 2, (height + 1) // 2)
+    right = width % 2
+    below = height % 2
+    padded = view.camera.cropped(0, 0, width + right, height + below)
+    camera = padded.resized((width + 1) // 2, (height + 1) // 2)
     covered = F.pad(view.mask, (0, right, 0, below))[None]
     share = F.avg_pool2d(covered, 2).clamp(min=1e-6)
 
@@ -59,9 +62,17 @@ def downsample2x(view: IncompleteView) -> IncompleteView:
         return F.avg_pool2d(F.pad(images, (0, right, 0, below)) * covered, 2) / share
 
     mask = (share[0] > 1e-6).to(covered)
-    rgb, weights, depth = mean(view.rgb), mean(view.weights), nearest_depth(view.depth)
-    small = replace(view, camera=camera, rgb=rgb, mask=mask, error=mask, depth=depth, weights=weights)
-    return replace(small, fade=None, target_mask=None)
+    return replace(
+        view,
+        camera=camera,
+        rgb=mean(view.rgb),
+        mask=mask,
+        error=mask,
+        depth=nearest_depth(view.depth),
+        weights=mean(view.weights),
+        fade=None,
+        target_mask=None,
+    )
 
 
 def upsample2x(
@@ -69,9 +80,10 @@ def upsample2x(
 ) -> Float[Tensor, "channel height width"]:
     """The image at twice its resolution, cut to `shape`, interpolated between values inside only."""
     known = inside.to(image)[None]
-    large = F.interpolate(torch.cat([image * known, known])[None], scale_factor=2, mode="bilinear")[0]
-    large = large[:, : shape[0], : shape[1]]
-    return large[:-1] / large[-1:].clamp(min=1e-6)
+    weighted = torch.cat([image * known, known])
+    large = F.interpolate(weighted[None], scale_factor=2, mode="bilinear")[0]
+    cut = large[:, : shape[0], : shape[1]]
+    return cut[:-1] / cut[-1:].clamp(min=1e-6)
 
 
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
@@ -85,7 +97,8 @@ def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows c
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
     """The mean of each cell, or of the part of it that the image has."""
     height, width = image.shape[1:]
-    return F.avg_pool2d(F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate"), CELL_PX)[0]
+    whole_cells = F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate")
+    return F.avg_pool2d(whole_cells, CELL_PX)[0]
 
 
 def scatter_to_image(
@@ -93,33 +106,47 @@ def scatter_to_image(
 ) -> Shaped[Tensor, "channel rows columns"]:
     """An image of this shape with the values at rows and columns, zeros elsewhere."""
     image = values.new_zeros(shape[0] * shape[1], values.shape[1])
-    return image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
+    image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values)
+    return image.view(*shape, -1).permute(2, 0, 1)
 
 
 def detail_bands(
     colours: Float[Tensor, "pixel image 3"], weight: Float[Tensor, "pixel"], pixels: Pixels, shape: torch.Size
 ) -> Float[Tensor, "pixel band image 3"]:
-    """What some images have around their own local means: a band for each of `BAND_PX`, the finest first.
+    """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
 
-    The images have `shape`, and `colours` at the pixels. A pixel's `weight` in the means is above 0.
+    Args:
+        colours: the images' colours at the pixels.
+        weight: weight of each pixel in the means, above 0.
+        pixels: row and column of each pixel.
+        shape: height and width of the images.
     """
     count = colours.shape[1]
-    values = torch.cat([(weight[:, None, None] * colours).flatten(1), weight[:, None]], 1)
-    image = scatter_to_image(values, pixels, shape)
-    bands, finer = [], colours
+    weighted = (weight[:, None, None] * colours).flatten(1)
+    image = scatter_to_image(torch.cat([weighted, weight[:, None]], 1), pixels, shape)
+    finer = colours
+    bands = []
     for side in BAND_PX:
-        if image.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_exporting():
-            import cv2
-
-            channels_last = image.permute(1, 2, 0).contiguous().numpy()  # faster than PyTorch by an order of magnitude
-            sums = torch.from_numpy(cv2.blur(channels_last, (side, side), borderType=cv2.BORDER_CONSTANT))
-            sums = sums[pixels[:, 0], pixels[:, 1]]
-        else:
-            sums = F.avg_pool2d(image[None], side, 1, side // 2)[0, :, pixels[:, 0], pixels[:, 1]].T
+        sums = _box_means_at(image, side, pixels)
         mean = (sums[:, :-1] / sums[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
         bands.append(finer - mean)
         finer = mean
     return torch.stack(bands, 1)
+
+
+def _box_means_at(
+    image: Float[Tensor, "channel height width"], side: int, pixels: Pixels
+) -> Float[Tensor, "pixel channel"]:
+    """Means over squares around pixels of an image, which is 0 beyond its border."""
+    rows, columns = pixels.unbind(1)
+    if image.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_exporting():
+        import cv2
+
+        # Faster than PyTorch by an order of magnitude
+        channels_last = image.permute(1, 2, 0).contiguous().numpy()
+        means = cv2.blur(channels_last, (side, side), borderType=cv2.BORDER_CONSTANT)
+        return torch.from_numpy(means)[rows, columns]
+    return F.avg_pool2d(image[None], side, 1, side // 2)[0, :, rows, columns].T
 
 
 def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
@@ -129,7 +156,9 @@ def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "r
     return image
 
 
-def concatenate_channels(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, "1 channel rows columns"]:
+def concatenate_channels(
+    *images: Shaped[Tensor, "_channel rows columns"],
+) -> Shaped[Tensor, "1 channel rows columns"]:
     """Images in one batch of one, channels last in memory as `scatter_to_image` has them: nothing is transposed."""
     return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
 
@@ -152,11 +181,20 @@ class UNet(nn.Module):
         super().__init__()
         widths = tuple(width + WIDER * scale for scale in range(4))
         self.enter = nn.Conv2d(channels, width, 1)
-        self.first = nn.Sequential(nn.Conv2d(width, width, 3, 1, 1), nn.ReLU(), nn.Conv2d(width, width, 3, 1, 1))
-        self.down = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.ReLU(), nn.Conv2d(coarse, coarse, 3, 1, 1), nn.ReLU())
-            for fine, coarse in pairwise(widths)
+        self.first = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=1),
         )
+        self.down = nn.ModuleList()
+        for fine, coarse in pairwise(widths):
+            layers = nn.Sequential(
+                nn.Conv2d(fine, coarse, 3, stride=2, padding=1),
+                nn.ReLU(),
+                nn.Conv2d(coarse, coarse, 3, padding=1),
+                nn.ReLU(),
+            )
+            self.down.append(layers)
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
         self.join = nn.ModuleList(nn.Conv2d(fine, fine, 3, padding=1) for fine in widths[:-1])
 
@@ -174,9 +212,11 @@ class UNet(nn.Module):
 
         The first layer has a kernel of one pixel, so it runs on those channels at the points only.
         """
-        own, weight = values.shape[1], self.enter.weight
-        x = F.conv2d(image.contiguous(memory_format=torch.channels_last), weight[:, own:], self.enter.bias)
-        at_points = F.linear(values, weight[:, :own, 0, 0]).to(x.dtype)
+        weight = self.enter.weight
+        first_channels = values.shape[1]
+        channels_last = image.contiguous(memory_format=torch.channels_last)
+        x = F.conv2d(channels_last, weight[:, first_channels:], self.enter.bias)
+        at_points = F.linear(values, weight[:, :first_channels, 0, 0]).to(x.dtype)
         return self._scales(F.relu(x + scatter_to_image(at_points, at, image.shape[2:])))
 
     def _scales(self, x: Float[Tensor, "1 feature height width"]) -> Float[Tensor, "1 feature height width"]:
@@ -185,12 +225,12 @@ class UNet(nn.Module):
         for layer in self.down:
             stop_if_cancelled()
             scales.append(layer(scales[-1]))
-        x = scales.pop()
+        joined = scales.pop()
         for scale, up, join in reversed(list(zip(scales, self.up, self.join, strict=True))):
             stop_if_cancelled()
-            coarse = F.interpolate(up(x), size=scale.shape[2:], mode="bilinear", align_corners=False)
-            x = F.relu(scale + join(F.relu(coarse + scale)))
-        return x
+            coarse = F.interpolate(up(joined), size=scale.shape[2:], mode="bilinear", align_corners=False)
+            joined = F.relu(scale + join(F.relu(coarse + scale)))
+        return joined
 
 
 def run_tiled(
@@ -207,29 +247,38 @@ def run_tiled(
     layers that act on single pixels.
     """
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
-    across = -(-shape[1] // TILE_PX)
-    number = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
-    tiles, own = number.unique(return_inverse=True)
-    rows, columns = tiles // across * TILE_PX, tiles % across * TILE_PX
-    end = TILE_PX + halo
-    border = bool(((rows < halo) | (columns < halo) | (rows + end > shape[0]) | (columns + end > shape[1])).any())
     cell_halo = -(-halo // CELL_PX) + 1
-    index = _windows(F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1), halo, TILE_PX)
-    frame = _frame(cells.shape[2:], cell_halo, TILE_PX // CELL_PX)
-    near = _windows(F.pad(cells, frame, mode="replicate")[0], cell_halo, TILE_PX // CELL_PX)
-    values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
-    outputs, first = [], 0
+    cut = CELL_PX * cell_halo - halo
+
+    # The tiles that contain a pixel
+    across = -(-shape[1] // TILE_PX)
+    tile_of_pixel = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
+    tiles, own = tile_of_pixel.unique(return_inverse=True)
+    tile_rows = tiles // across
+    tile_columns = tiles % across
+    at_border = _reaches_border(tile_rows, tile_columns, halo, shape)
+
+    # Windows of all tiles: indices of values, and cells
+    padded_values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
+    padded_index = F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1)
+    index = _windows(padded_index, halo, TILE_PX)[0]
+    padded_cells = F.pad(cells, _frame(cells.shape[2:], cell_halo, TILE_PX // CELL_PX), mode="replicate")
+    near = _windows(padded_cells[0], cell_halo, TILE_PX // CELL_PX)
+
+    outputs = []
+    first = 0
     while first < len(tiles):
         stop_if_cancelled()
         size = next(size for size in AT_ONCE if size <= len(tiles) - first)
-        part = slice(first, first := first + size)
-        at = rows[part] // TILE_PX, columns[part] // TILE_PX
-        fine = F.interpolate(near[:, *at].movedim(0, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-        cut = CELL_PX * cell_halo - halo
+        rows = tile_rows[first : first + size]
+        columns = tile_columns[first : first + size]
+        coarse = near[:, rows, columns].movedim(0, 1)
+        fine = F.interpolate(coarse, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
         fine = fine[:, :, cut:-cut, cut:-cut].to(values)
-        x = torch.cat([fine.movedim(1, 3), values[index[0, *at]]], 3).movedim(3, 1)
-        inside = _inside(rows[part], columns[part], halo, shape).to(x) if border else None
+        x = torch.cat([fine.movedim(1, 3), padded_values[index[rows, columns]]], 3).movedim(3, 1)
+        inside = _inside(rows, columns, halo, shape).to(x) if at_border else None
         outputs.append(_run_unpadded(layers, x, inside))
+        first += size
     return torch.cat(outputs)[own, :, pixels[:, 0] % TILE_PX, pixels[:, 1] % TILE_PX]
 
 
@@ -244,17 +293,31 @@ def _windows(image: Shaped[Tensor, "channel height width"], halo: int, tile: int
     return image.unfold(1, tile + 2 * halo, tile).unfold(2, tile + 2 * halo, tile)
 
 
+def _reaches_border(
+    tile_rows: Int[Tensor, "tile"], tile_columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
+) -> bool:
+    """Whether any tile with its halo reaches beyond the image."""
+    beyond = False
+    for tile, length in ((tile_rows, shape[0]), (tile_columns, shape[1])):
+        first = tile * TILE_PX
+        beyond |= bool(((first < halo) | (first + TILE_PX + halo > length)).any())
+    return beyond
+
+
 def _inside(
-    rows: Int[Tensor, "tile"], columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
+    tile_rows: Int[Tensor, "tile"], tile_columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
 ) -> Float[Tensor, "tile 1 height width"]:
     """1 where a tile with its halo is in the image; beyond it, layers must get zeros."""
-    reach = torch.arange(-halo, TILE_PX + halo, device=rows.device)
-    down, right = rows[:, None] + reach, columns[:, None] + reach
-    down, right = (down >= 0) & (down < shape[0]), (right >= 0) & (right < shape[1])
-    return (down[:, None, :, None] & right[:, None, None, :]).float()
+    reach = torch.arange(-halo, TILE_PX + halo, device=tile_rows.device)
+    row = tile_rows[:, None] * TILE_PX + reach
+    column = tile_columns[:, None] * TILE_PX + reach
+    row_inside = (row >= 0) & (row < shape[0])
+    column_inside = (column >= 0) & (column < shape[1])
+    return (row_inside[:, None, :, None] & column_inside[:, None, None, :]).float()
 
 
 def _run_unpadded(layers: nn.Sequential, x: Tensor, inside: Tensor | None) -> Tensor:
+    """The layers without padding; what is not `inside` the image is 0 before each convolution."""
     x = x if inside is None else x * inside
     for layer in layers:
         if not isinstance(layer, nn.Conv2d):

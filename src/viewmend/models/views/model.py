@@ -10,9 +10,10 @@ learned gain for every pixel.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -25,6 +26,7 @@ from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregato
 from viewmend.models.views.config import COLOUR, FEATURES, MASK, OFFSETS, RaysConfig, ViewsConfig
 from viewmend.models.views.error_predictor import ErrorPredictor, fallback_view
 from viewmend.models.views.grid import (
+    BAND_PX,
     CELL_PX,
     Pixels,
     UNet,
@@ -38,32 +40,85 @@ from viewmend.models.views.grid import (
     run_tiled,
     scatter_to_image,
 )
-from viewmend.models.views.prediction import DepthDistribution, ViewPrediction, unpremultiply
+from viewmend.models.views.prediction import (
+    DepthDistribution,
+    SurfacePoints,
+    ViewPrediction,
+    surface_points,
+    unpremultiply,
+)
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.models.views.sampler import Rays, sample_rays
+from viewmend.models.views.sampler import Rays, RayStatistics, sample_rays
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
 Mask = Bool[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
-Inputs = Float[Tensor, "7 height width"]
 IMAGE_CHANNELS = 7
-"""RGB of the first guess, M, whether a pixel is coloured, its largest source weight, and whether it is predicted."""
-CHOICES = 4
-"""Colours that a pixel blends: trusted cameras at its depth, the most trusted one, the mean over depths, the guess."""
-DETAILS = 6
-"""Gains of detail: in two bands, of the blended colours, the most trusted camera's, and the guess."""
+"""`ViewImage` has this many channels."""
+CELL_CHANNELS = IMAGE_CHANNELS + 2
+"""A cell of the U-Net also has its relative depth, and whether it has a depth at all."""
+CANDIDATES = 4
+"""A pixel blends this many colours: the fields of `CandidateColours`."""
+DETAILS = 3 * len(BAND_PX)
+"""A pixel has this many gains of detail: in each band those of the blended colours, of one camera, and of the guess."""
 INITIAL_GAIN = 0.3
-"""Of the finest details of the blended colours, before training."""
+"""The gain of the finest detail of the blended colours before training."""
 PIXEL_CHANNELS = 27
-"""Inputs of a pixel at full resolution: the colours of the choices, two differences and two masks of them, statistics
-of its ray sample, and the certainty of its depth."""
-JOINT = 0.03
-"""A pixel belongs to the surface of its cell if their depths differ by less than this, in subject sizes."""
-LEAST_WEIGHT = 0.01
-"""Of pixels outside the subject in the local means around which there is detail."""
+"""The last convolutions get this many numbers per pixel, in addition to the features of the U-Net and the sample."""
+OUTPUT_CHANNELS = (CANDIDATES, 1, 1, DETAILS)
+"""The last convolutions give a score for each candidate colour, alpha, confidence, and gains of detail."""
+ALPHA_SLOPE = 4.0
+"""The cameras' mean mask, from -0.5 to 0.5, is added to the logit of alpha with this factor."""
+MIN_DETAIL_WEIGHT = 0.01
+"""A pixel outside the subject has at least this weight in the local means around which there is detail."""
 MARGIN_PX = 16
+"""A crop with this margin around the subject gives the same prediction as the whole view, pixels."""
+
+
+class ViewImage(NamedTuple):
+    """What the network gets of the rendered view itself."""
+
+    guess: Image
+    """RGB on black, with holes filled by the coarse guess."""
+    mask: Float[Tensor, "height width"]
+    """M: 1 where the proxy covers the pixel."""
+    coloured: Float[Tensor, "height width"]
+    """1 where a source camera coloured the pixel."""
+    largest_weight: Float[Tensor, "height width"]
+    """The largest weight of a source camera in the pixel's colour."""
+    predicted: Float[Tensor, "height width"]
+    """1 where the pixel is predicted."""
+
+    @classmethod
+    def of(cls, view: IncompleteView, guess: Image, predicted: Mask) -> "ViewImage":
+        """The inputs from a view whose holes are filled in `guess`."""
+        coloured = view.weights.sum(0) > 0
+        return cls(guess, view.mask, coloured.float(), view.weights.amax(0), predicted.float())
+
+    def stacked(self) -> Float[Tensor, "7 height width"]:
+        """All channels in one image."""
+        return torch.cat([self.guess, torch.stack(self[1:])])
+
+
+class CandidateColours(NamedTuple):
+    """The colours that a pixel blends: RGB in [0, 1], not multiplied by alpha."""
+
+    trusted: Float[Tensor, "pixel 3"]
+    """The mean of the cameras on the surface, weighted by trust."""
+    single: Float[Tensor, "pixel 3"]
+    """The colour of the most trusted camera."""
+    soft: Float[Tensor, "pixel 3"]
+    """The mean over all depth hypotheses, interpolated between cells."""
+    guess: Float[Tensor, "pixel 3"]
+    """The rendered view, or the coarse guess in holes."""
+    soft_mask: Float[Tensor, "pixel 1"]
+    """The mask that belongs to `soft`, which the last convolutions get too."""
+
+    def stacked(self) -> Float[Tensor, "pixel 4 3"]:
+        """The colours, in the order of their scores."""
+        return torch.stack(self[:CANDIDATES], 1)
 
 
 class ViewSynthNet(Network):
@@ -72,27 +127,41 @@ class ViewSynthNet(Network):
     config: ViewsConfig  # pyright: ignore
     trained_in_bfloat16 = True
     error_rule = "all"
-    """It keeps pixels that are correct by itself."""
+    """The whole subject is predicted: the model learned to keep the pixels that are already correct."""
 
     def __init__(self, config: ViewsConfig | None = None) -> None:
         super().__init__()
         config = config or ViewsConfig()
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+
+        # The first guess for holes, and the predictor of errors
         self.coarse = None
         if config.coarse_fill == "rays":
             self.coarse = RayFill(RaysConfig(num_views=config.num_views)).requires_grad_(False)
         self.errors = ErrorPredictor(config.error_features) if config.error_features else None
         self.predicts_errors = self.errors is not None
+
+        # Depth, at half the resolution
         self.sample_aggregator = SampleAggregator(config.width, config.sample_channels)
-        self.unet = UNet(len(OFFSETS) * config.sample_channels + IMAGE_CHANNELS + 2, config.features)
+        self.unet = UNet(len(OFFSETS) * config.sample_channels + CELL_CHANNELS, config.features)
         self.depth_logits = nn.Conv2d(config.features, len(OFFSETS), 1)
+
+        # Blending, at full resolution
         self.pixel_aggregator = SampleAggregator(config.width, config.sample_channels)
-        inputs, fine = config.features + PIXEL_CHANNELS + config.sample_channels, config.fine_features
-        last = nn.Conv2d(fine, CHOICES + 2 + DETAILS, 3, padding=1)
+        inputs = config.features + PIXEL_CHANNELS + config.sample_channels
+        fine = config.fine_features
+        last = nn.Conv2d(fine, sum(OUTPUT_CHANNELS), 3, padding=1)
         with torch.no_grad():
-            last.weight[-DETAILS:], last.bias[-DETAILS:] = 0, torch.eye(DETAILS)[0] * INITIAL_GAIN  # pyright: ignore
+            assert last.bias is not None
+            last.weight[-DETAILS:] = 0
+            last.bias[-DETAILS:] = 0
+            last.bias[-DETAILS] = INITIAL_GAIN
         self.blending = nn.Sequential(
-            *(nn.Conv2d(inputs, fine, 3, padding=1), nn.ReLU(), nn.Conv2d(fine, fine, 3, padding=1), nn.ReLU()), last
+            nn.Conv2d(inputs, fine, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(fine, fine, 3, padding=1),
+            nn.ReLU(),
+            last,
         )
 
     def forward(
@@ -103,19 +172,25 @@ class ViewSynthNet(Network):
         where: Mask | None = None,
         guess: Image | None = None,
     ) -> ViewPrediction:
-        """The prediction for pixels of a view; its E is not used.
+        """Predicts pixels of a view; its E is not used.
 
-        For a crop, `scale` is that of the whole view, and `guess` the `coarse_guess` of the whole view, cropped. Pixels
-        are predicted `where` they are on the proxy or its rim; None for all of these.
+        Args:
+            view: the rendered view, or a crop of it.
+            sources: the cameras to sample.
+            scale: the scale of the whole view, if `view` is a crop.
+            where: the pixels to predict, of those on the proxy and its rim; None for all of these.
+            guess: the `coarse_guess` of the whole view, cropped as `view` is; computed if None.
         """
-        guess = self.coarse_guess(view, sources) if guess is None else guess
-        scale = scale or SceneScale.of(view)
-        depth, coloured = rim_depth(view.depth), view.weights.sum(0) > 0
-        where = depth > 0 if where is None else where & (depth > 0)
-        image = torch.cat([guess, torch.stack([view.mask, coloured.float(), view.weights.amax(0), where.float()])])
-        view = replace(view, depth=depth)
-        distribution = self._depth_distribution(view, sources, scale, where, image)
-        return self._blend(view, sources, scale, torch.nonzero(where), image, distribution)
+        if guess is None:
+            guess = self.coarse_guess(view, sources)
+        if scale is None:
+            scale = SceneScale.of(view)
+        view = replace(view, depth=rim_depth(view.depth))
+        on_proxy = view.depth > 0
+        predicted = on_proxy if where is None else where & on_proxy
+        image = ViewImage.of(view, guess, predicted)
+        distribution = self._depth_distribution(view, sources, scale, predicted, image)
+        return self._blend(view, sources, scale, torch.nonzero(predicted), image, distribution)
 
     @torch.no_grad()
     def coarse_guess(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
@@ -128,8 +203,10 @@ class ViewSynthNet(Network):
     @light_operations()
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """The predicted errors of a rendered view; None without an `ErrorPredictor` or cameras."""
-        sources = SourceCameras.closest_to(view, context, self.config.num_views) if self.errors is not None else None
-        if self.errors is None or sources is None:
+        if self.errors is None:
+            return None
+        sources = SourceCameras.closest_to(view, context, self.config.num_views)
+        if sources is None:
             return None
         return self.errors.predict(view, sources, context.quality)
 
@@ -138,7 +215,7 @@ class ViewSynthNet(Network):
         SourceCameras.of(views, None, context)
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
-        """The surroundings of the subject show where its outline is."""
+        """The margin that shows where the subject's outline is."""
         return MARGIN_PX
 
     @torch.no_grad()
@@ -148,43 +225,67 @@ class ViewSynthNet(Network):
 
         With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their surroundings.
         """
+        fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
         fades = torch.zeros_like(where) if view.fade is None else view.fade > 0
-        if context.quality.refine_fraction == 0 and bool((where | fades).any()):
+
+        # No camera is sampled
+        if fraction == 0 and bool((where | fades).any()):
             return fallback_view(view, fades, self.coarse_guess(view, None, quick=True)), state
-        sources = SourceCameras.closest_to(view, context, self.config.num_views) if bool(where.any()) else None
+        sources = None
+        if bool(where.any()):
+            sources = SourceCameras.closest_to(view, context, self.config.num_views)
         if sources is None:
             return (CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, fades)), state
-        quick = context.quality.refine_fraction is not None
+
+        # The subject, or a part of it, is predicted
+        quick = fraction is not None
         guess = self.coarse_guess(view, sources, quick)
         ray_fill = guess if not quick and self.coarse is not None else None
-        completed = self(view, sources, where=where, guess=guess).composite_into(view, where, fades, ray_fill)
+        prediction = self(view, sources, where=where, guess=guess)
+        completed = prediction.composite_into(view, where, fades, ray_fill)
         return opaque_in_mask(completed), state
 
     def _depth_distribution(
-        self, view: IncompleteView, sources: SourceCameras, scale: SceneScale, where: Mask, image: Inputs
+        self,
+        view: IncompleteView,
+        sources: SourceCameras,
+        scale: SceneScale,
+        predicted: Mask,
+        image: ViewImage,
     ) -> DepthDistribution:
-        """Samples on the rays of all cells, judged by a U-Net over the view."""
-        depth = nearest_depth(view.depth * where)
+        """Samples the cameras on the rays of all cells, and judges the samples by a U-Net over the view."""
+        # Cells with a pixel to predict, and the depth hypotheses on their rays
+        depth = nearest_depth(view.depth * predicted)
         cells = torch.nonzero(depth > 0)
-        z = depth[tuple(cells.T)][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
-        rays = Rays(view, scale, CELL_PX * (cells.flip(1).double() + 0.5), z).split(sources.rays_at_once)
+        rows, columns = cells.unbind(1)
+        z_m = depth[rows, columns][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
+        rays = Rays(view, scale, CELL_PX * (cells.flip(1).double() + 0.5), z_m)
+
+        # Images of cells for the U-Net: the rendered view, and where the proxy is
         front = nearest_depth(view.depth)
-        beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
-        means = cell_means(image)
+        relative = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        means = cell_means(image.stacked())
+        images = torch.cat([means, relative[None], (front > 0)[None].to(means)])
+
+        # Scores of the hypotheses, by their samples and by their neighbourhood
         with self.autocast():
-            parts = []
-            for part in rays:
-                stop_if_cancelled()
-                parts.append(self.sample_aggregator(sample_rays(part, sources, float(CELL_PX))))
-            samples = AggregatedSamples(*map(torch.cat, zip(*parts, strict=True)))
+            samples = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
-            images = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(inputs)
             stop_if_cancelled()
             with heavy_operations():
-                features = self.unet.forward_points(inputs, cells, concatenate_channels(images))
-            logits = self.depth_logits(features)[0, :, cells[:, 0], cells[:, 1]].T.float() + samples.score.float()
+                features = self.unet.forward_points(inputs, cells, concatenate_channels(images.to(inputs)))
+            logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
         return DepthDistribution(cells, index_image(cells, depth.shape), depth, logits, samples, features)
+
+    def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
+        """The aggregated samples of the rays of cells, chunk by chunk."""
+        parts = []
+        for chunk in rays.split(sources.rays_at_once):
+            stop_if_cancelled()
+            samples = sample_rays(chunk, sources, step_px=float(CELL_PX))
+            parts.append(self.sample_aggregator(samples))
+        return AggregatedSamples(*map(torch.cat, zip(*parts, strict=True)))
 
     def _blend(
         self,
@@ -192,57 +293,41 @@ class ViewSynthNet(Network):
         sources: SourceCameras,
         scale: SceneScale,
         pixels: Pixels,
-        image: Inputs,
+        image: ViewImage,
         distribution: DepthDistribution,
     ) -> ViewPrediction:
-        """Samples the cameras at the depth of each pixel, and blends them."""
+        """Samples the cameras on the surface that each pixel shows, and blends them."""
+        # Sample the cameras at the depth found
         stop_if_cancelled()
-        hypothesis, offset, certainty = self._depth_offset(pixels, distribution)
-        cell = distribution.cell_index[tuple((pixels // CELL_PX).T)]
-        own, front = view.depth[tuple(pixels.T)], distribution.depth[tuple(distribution.cells.T)][cell]
-        front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
-        depth = front + scale.size_m * offset
-        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, depth.detach()[:, None])
-        samples = sample_rays(rays, sources, 1.0, cubic=True)
-        stop_if_cancelled()
-        with self.autocast():
-            blended = self.pixel_aggregator(samples, distribution.samples.trust[cell, hypothesis][:, None])
-        sharp = unpremultiply(blended.colour[:, 0], blended.mask[:, 0])
-        best = blended.trust[:, 0].argmax(1)[:, None, None].expand(-1, 1, FEATURES)
-        best = samples.features[:, 0].gather(1, best)[:, 0]
-        single = unpremultiply(best[:, COLOUR], best[:, MASK])
-        shares = distribution.logits.softmax(1)[..., None]
-        means = [(shares * part).sum(1) for part in (distribution.samples.colour, distribution.samples.mask)]
-        means = distribution.interpolate(torch.cat(means, 1), pixels)
-        soft = unpremultiply(means[:, :3], means[:, 3:])
-        here = image[:, pixels[:, 0], pixels[:, 1]].T
-        guess = here[:, :3]
-        inputs = [sharp, single, soft, guess, sharp - guess, blended.mask[:, 0], means[:, 3:], here[:, 4:6]]
-        inputs += [samples.statistics[:, 0, 3:6].mean(1, keepdim=True), samples.statistics[:, 0, 6:]]
-        inputs += [certainty[:, None], (sharp - single).abs().mean(1, keepdim=True), offset[:, None]]
-        inputs += [blended.features[:, 0]]
-        out = self._blending_layers(torch.cat(inputs, 1), pixels, view.mask.shape, distribution.features)
-        choice = out[:, :CHOICES].softmax(1)
-        straight = (choice[..., None] * torch.stack([sharp, single, soft, guess], 1)).sum(1)
-        alpha = (out[:, CHOICES] + 4 * (blended.mask[:, 0, 0] - 0.5)).sigmoid()
-        confidence = out[:, CHOICES + 1].sigmoid()
-        weight = blended.mask[:, 0, 0].clamp_min(LEAST_WEIGHT)
-        bands = detail_bands(torch.stack([straight, single, guess], 1), weight, pixels, view.mask.shape)
-        gains = out[:, CHOICES + 2 :].unflatten(1, bands.shape[1:3])
-        sharp = (straight + (gains[..., None] * bands).sum((1, 2))).clamp(0, 1)
-        rgb, trust = alpha[:, None] * sharp, blended.trust[:, 0]
-        return ViewPrediction(pixels, rgb, alpha, confidence, depth, trust, distribution)
+        surface = surface_points(view.depth, scale, pixels, distribution)
+        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, surface.depth.detach()[:, None])
+        samples = sample_rays(rays, sources, step_px=1.0, cubic=True)
 
-    def _depth_offset(
-        self, pixels: Pixels, distribution: DepthDistribution
-    ) -> tuple[Int[Tensor, "pixel"], Float[Tensor, "pixel"], Float[Tensor, "pixel"]]:
-        """Each pixel's most probable hypothesis, the mean offset around it in subject sizes, and its probability."""
-        shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
-        best = shares.argmax(1)
-        around = torch.stack([best - 1, best, best + 1], 1).clamp(0, len(OFFSETS) - 1)
-        weight = shares.gather(1, around) + 1e-6
-        offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
-        return best, offset, shares.amax(1)
+        # Weigh the cameras, beginning with the trust that they have in the pixel's cell
+        stop_if_cancelled()
+        prior = distribution.samples.trust[surface.cell, surface.hypothesis]
+        with self.autocast():
+            aggregated = self.pixel_aggregator(samples, prior[:, None])
+        mask = aggregated.mask[:, 0]
+        trust = aggregated.trust[:, 0]
+
+        # Score the candidate colours and the gains of detail by the last convolutions
+        colours = candidate_colours(samples.features[:, 0], aggregated, image, pixels, distribution)
+        statistics = RayStatistics.unstack(samples.statistics[:, 0])
+        inputs = pixel_inputs(colours, mask, statistics, surface, image, pixels)
+        inputs = torch.cat([inputs, aggregated.features[:, 0]], 1)
+        out = self._blending_layers(inputs, pixels, view.mask.shape, distribution.features)
+        scores, alpha_logit, confidence_logit, gains = out.split(OUTPUT_CHANNELS, 1)
+
+        # Blend the colours, then add detail
+        blended = (scores.softmax(1)[..., None] * colours.stacked()).sum(1)
+        alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask[:, 0] - 0.5)).sigmoid()
+        confidence = confidence_logit[:, 0].sigmoid()
+        detailed = torch.stack([blended, colours.single, colours.guess], 1)
+        bands = detail_bands(detailed, mask[:, 0].clamp_min(MIN_DETAIL_WEIGHT), pixels, view.mask.shape)
+        detail = (gains.unflatten(1, bands.shape[1:3])[..., None] * bands).sum((1, 2))
+        rgb = alpha[:, None] * (blended + detail).clamp(0, 1)
+        return ViewPrediction(pixels, rgb, alpha, confidence, surface.depth, trust, distribution)
 
     def _blending_layers(
         self,
@@ -251,11 +336,78 @@ class ViewSynthNet(Network):
         shape: torch.Size,
         features: Float[Tensor, "1 feature rows columns"],
     ) -> Float[Tensor, "pixel output"]:
-        """The last convolutions, at these pixels."""
+        """The last convolutions, at these pixels of an image of this shape."""
         with self.autocast(), heavy_operations():
             if inputs.device.type == "cpu" and not torch.is_grad_enabled():
                 return run_tiled(self.blending, features, inputs.to(features), pixels, shape).float()
-            near = F.interpolate(features, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-            near = crop_to(near[0], shape)
+            upsampled = F.interpolate(features, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
+            near = crop_to(upsampled[0], shape)
             out = self.blending(concatenate_channels(near, scatter_to_image(inputs.to(near), pixels, shape)))
-        return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
+        rows, columns = pixels.unbind(1)
+        return out[0, :, rows, columns].T.float()
+
+
+def candidate_colours(
+    cameras: Float[Tensor, "pixel view feature"],
+    aggregated: AggregatedSamples,
+    image: ViewImage,
+    pixels: Pixels,
+    distribution: DepthDistribution,
+) -> CandidateColours:
+    """The colours that each pixel may have.
+
+    Args:
+        cameras: features of each pixel's sample on the surface in every camera.
+        aggregated: these samples after aggregation over cameras.
+        image: the rendered view.
+        pixels: row and column of each pixel.
+        distribution: the depth hypotheses of the cells.
+    """
+    # On the surface: all cameras by their trust, and the most trusted one alone
+    trusted = unpremultiply(aggregated.colour[:, 0], aggregated.mask[:, 0])
+    best = aggregated.trust[:, 0].argmax(1)
+    best_features = cameras.gather(1, best[:, None, None].expand(-1, 1, FEATURES))[:, 0]
+    single = unpremultiply(best_features[:, COLOUR], best_features[:, MASK])
+
+    # On the whole ray: the mean over depth hypotheses
+    probability = distribution.logits.softmax(1)[..., None]
+    mean_colour = (probability * distribution.samples.colour).sum(1)
+    mean_mask = (probability * distribution.samples.mask).sum(1)
+    means = distribution.interpolate(torch.cat([mean_colour, mean_mask], 1), pixels)
+    soft_colour, soft_mask = means.split((3, 1), 1)
+    soft = unpremultiply(soft_colour, soft_mask)
+
+    rows, columns = pixels.unbind(1)
+    return CandidateColours(trusted, single, soft, image.guess[:, rows, columns].T, soft_mask)
+
+
+def pixel_inputs(
+    colours: CandidateColours,
+    mask: Float[Tensor, "pixel 1"],
+    statistics: RayStatistics,
+    surface: SurfacePoints,
+    image: ViewImage,
+    pixels: Pixels,
+) -> Float[Tensor, "pixel 27"]:
+    """The inputs of the last convolutions that no layer made, in the order that they were trained on.
+
+    `mask` is the mean mask of the cameras on the surface, and `statistics` are those of the sample there.
+    """
+    rows, columns = pixels.unbind(1)
+    inputs = [
+        colours.trusted,
+        colours.single,
+        colours.soft,
+        colours.guess,
+        colours.trusted - colours.guess,
+        mask,
+        colours.soft_mask,
+        image.coloured[rows, columns][:, None],
+        image.largest_weight[rows, columns][:, None],
+        statistics.colour_variance.mean(1, keepdim=True),
+        statistics.smallest_masks,
+        surface.probability[:, None],
+        (colours.trusted - colours.single).abs().mean(1, keepdim=True),
+        surface.offset[:, None],
+    ]
+    return torch.cat(inputs, 1)

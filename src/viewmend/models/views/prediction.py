@@ -1,5 +1,6 @@
 """The depth distribution and the prediction of `ViewSynthNet`."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -11,21 +12,38 @@ from torch.nn import functional as F
 
 from viewmend.models.compositing import blend
 from viewmend.models.views.aggregation import AggregatedSamples
-from viewmend.models.views.grid import CELL_PX, scatter_to_image
+from viewmend.models.views.config import OFFSETS
+from viewmend.models.views.grid import CELL_PX, Pixels, scatter_to_image
+from viewmend.models.views.pyramids import SceneScale
 from viewmend.types import CompletedView, IncompleteView
 
 Plane = Float[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
 Mask = Bool[Tensor, "height width"]
-LEAST_MASK = 0.1
-"""Lower bound of the mask by which colours on black are divided."""
+MIN_MASK = 0.1
+"""Colours on black are divided by their mask, but by no less than this."""
 HOLE_GUESS = 0.7
-"""Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
-VISIBLE = 1 / 16
-"""Alpha or colour from which pixels belong to an island."""
-TINY, SMALL, FAINT = 0.001, 0.05, 0.6
-"""Islands below the first share of the largest one's area are removed, and those below the second if their mean alpha
-is below the third: remains of a phantom of the hull that was mostly recognised as one."""
+"""The colour of a hole takes this share from `RayFill`, and the rest from `ViewSynthNet`, which saw few holes in
+training."""
+SAME_SURFACE = 0.03
+"""A pixel shows the surface of its cell if their depths on the proxy differ by less than this, in subject sizes."""
+
+
+@dataclass(frozen=True)
+class IslandRule:
+    """Which islands around the subject are remains of a hull artefact that was mostly recognised as one."""
+
+    visible: float = 1 / 16
+    """A pixel belongs to an island if its alpha or its colour is above this."""
+    tiny: float = 0.001
+    """An island is removed if its area is below this share of the largest one's."""
+    small: float = 0.05
+    """A faint island is removed if its area is below this share of the largest one's."""
+    faint: float = 0.6
+    """An island is faint if its mean alpha is below this."""
+
+
+ISLANDS = IslandRule()
 
 
 class DepthDistribution(NamedTuple):
@@ -43,25 +61,43 @@ class DepthDistribution(NamedTuple):
     features: Float[Tensor, "1 feature rows columns"]
     """Output of the U-Net."""
 
-    def interpolate(
-        self, values: Float[Tensor, "cell channel"], pixels: Int[Tensor, "pixel 2"]
-    ) -> Float[Tensor, "pixel channel"]:
+    def interpolate(self, values: Float[Tensor, "cell channel"], pixels: Pixels) -> Float[Tensor, "pixel channel"]:
         """The cells' values at pixels (row, column), bilinearly between existing cells."""
-        padded = F.pad(F.pad(values, (0, 1), value=1.0), (0, 0, 0, 1))  # the last row stands for missing cells
+        weighted = F.pad(values, (0, 1), value=1.0)
+        padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
+
+        # A pixel's centre is a quarter of a cell off the centre of its own cell, towards the next one.
         own = pixels // CELL_PX
-        next_to = own + 2 * (pixels % CELL_PX) - 1  # a pixel's centre is a quarter of a cell off its cell's
         last = torch.tensor(self.cell_index.shape, device=own.device) - 1
-        near = ((3 / 4, own), (1 / 4, torch.minimum(next_to.clamp(min=0), last)))
-        parts = [a * b * padded[self.cell_index[rows[:, 0], columns[:, 1]]] for a, rows in near for b, columns in near]
-        at = torch.stack(parts).sum(0)
-        return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
+        other = torch.minimum((own + 2 * (pixels % CELL_PX) - 1).clamp(min=0), last)
+        parts = []
+        for row_share, rows in ((3 / 4, own), (1 / 4, other)):
+            for column_share, columns in ((3 / 4, own), (1 / 4, other)):
+                index = self.cell_index[rows[:, 0], columns[:, 1]]
+                parts.append(row_share * column_share * padded[index])
+        total = torch.stack(parts).sum(0)
+        return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
+
+
+class SurfacePoints(NamedTuple):
+    """The points of the surface that some pixels show."""
+
+    cell: Int[Tensor, "pixel"]
+    """Index of each pixel's cell."""
+    hypothesis: Int[Tensor, "pixel"]
+    """Index of the most probable depth hypothesis."""
+    probability: Float[Tensor, "pixel"]
+    """Its probability."""
+    offset: Float[Tensor, "pixel"]
+    """Distance behind the proxy in subject sizes: the mean over the most probable hypothesis and its neighbours."""
+    depth: Float[Tensor, "pixel"]
+    """z-depth, metres."""
 
 
 class ViewPrediction(NamedTuple):
     """The prediction for some pixels of a view."""
 
-    pixels: Int[Tensor, "pixel 2"]
-    """Row and column."""
+    pixels: Pixels
     rgb: Float[Tensor, "pixel 3"]
     """In [0, 1], on black."""
     alpha: Float[Tensor, "pixel"]
@@ -74,48 +110,92 @@ class ViewPrediction(NamedTuple):
     distribution: DepthDistribution
 
     def composite_into(
-        self, view: IncompleteView, predicted: Mask, fades: Mask, fill: Image | None = None, keep_remains: bool = False
+        self,
+        view: IncompleteView,
+        predicted: Mask,
+        fades: Mask,
+        fill: Image | None = None,
+        keep_remains: bool = False,
     ) -> CompletedView:
         """The rendered view with this prediction: Fhat = E Ftilde + (1 - E) F.
 
-        `predicted` are the pixels of this prediction. Those that are background in part, `fades`, are attenuated by E.
-        `fill` is the output of `RayFill`, to blend into holes. `keep_remains` leaves `remains_of_phantoms` in the view.
+        Args:
+            view: the rendered view.
+            predicted: the pixels of this prediction.
+            fades: pixels that are partly background, which are attenuated by E.
+            fill: the output of `RayFill`, to blend into holes.
+            keep_remains: whether `remains_of_phantoms` stay in the view.
         """
-        E = view.error
-        rgb, alpha, confidence, depth = (
-            scatter_to_image(values, self.pixels, view.mask.shape)
-            for values in (self.rgb, self.alpha[:, None], self.confidence[:, None], self.depth[:, None])
-        )
+        shape = view.mask.shape
+        rgb = scatter_to_image(self.rgb, self.pixels, shape)
+        alpha = scatter_to_image(self.alpha[:, None], self.pixels, shape)[0]
+        confidence = scatter_to_image(self.confidence[:, None], self.pixels, shape)[0]
+        depth = scatter_to_image(self.depth[:, None], self.pixels, shape)[0]
         if fill is not None:
-            guess = torch.minimum(HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, alpha)  # `fill` has no alpha of its own
-            rgb = torch.where(predicted & view.holes, guess, rgb)
+            mixed = HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb
+            under_alpha = torch.minimum(mixed, alpha)  # the fill has no alpha of its own
+            rgb = torch.where(predicted & view.holes, under_alpha, rgb)
         if not keep_remains:
             colour = torch.where(predicted, rgb.amax(0), view.rgb.amax(0))
-            keep = ~remains_of_phantoms(colour, torch.where(predicted, alpha[0], view.mask), predicted)
-            rgb, alpha, confidence, depth = rgb * keep, alpha * keep, confidence * keep, depth * keep
+            opacity = torch.where(predicted, alpha, view.mask)
+            keep = ~remains_of_phantoms(colour, opacity, predicted)
+            rgb = rgb * keep
+            alpha = alpha * keep
+            confidence = confidence * keep
+            depth = depth * keep
+
+        E = view.error
+        changed = predicted | fades
         return CompletedView(
             view,
-            blend(view.rgb, E, rgb, (predicted | fades).to(E)),
-            torch.where(predicted | fades, E * alpha[0] + (1 - E) * view.mask, view.mask),
-            torch.where(predicted, E * confidence[0] + (1 - E), view.mask),
-            torch.where(predicted, depth[0] * (alpha[0] > 0.5), view.depth),
+            rgb=blend(view.rgb, E, rgb, changed.to(E)),
+            alpha=torch.where(changed, E * alpha + (1 - E) * view.mask, view.mask),
+            confidence=torch.where(predicted, E * confidence + (1 - E), view.mask),
+            depth=torch.where(predicted, depth * (alpha > 0.5), view.depth),
         )
+
+
+def surface_points(
+    proxy_depth: Plane, scale: SceneScale, pixels: Pixels, distribution: DepthDistribution
+) -> SurfacePoints:
+    """The points that pixels show, by the depth distribution of the cells around them.
+
+    A pixel starts from its own depth on the proxy, unless its cell has the depth of another surface in front of it.
+    """
+    # The most probable hypothesis, and the mean offset around it
+    shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
+    best = shares.argmax(1)
+    around = torch.stack([best - 1, best, best + 1], 1).clamp(0, len(OFFSETS) - 1)
+    weight = shares.gather(1, around) + 1e-6
+    offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
+
+    # The proxy's depth from which this offset counts
+    cell_row, cell_column = (pixels // CELL_PX).unbind(1)
+    cell = distribution.cell_index[cell_row, cell_column]
+    own_depth = proxy_depth[tuple(pixels.T)]
+    cell_depth = distribution.depth[tuple(distribution.cells.T)][cell]
+    same = (own_depth - cell_depth).abs() < SAME_SURFACE * scale.size_m
+    depth = torch.where(same, own_depth, cell_depth) + scale.size_m * offset
+    return SurfacePoints(cell, best, shares.amax(1), offset, depth)
 
 
 def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
     """Small islands around the subject all of whose pixels are `predicted`; `colour` is their largest channel."""
-    visible, opacity = (torch.maximum(colour, alpha) > VISIBLE).cpu().numpy(), alpha.float().cpu().numpy()
+    visible = (torch.maximum(colour, alpha) > ISLANDS.visible).cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:
         return torch.zeros_like(predicted)
     area = stats[:, cv2.CC_STAT_AREA]
-    share, faint = area / area[1:].max(), np.bincount(labels.ravel(), opacity.ravel()) < FAINT * area
+    share = area / area[1:].max()
+    total_alpha = np.bincount(labels.ravel(), alpha.float().cpu().numpy().ravel())
+    faint = total_alpha < ISLANDS.faint * area
     rendered = np.bincount(labels[~predicted.cpu().numpy()], minlength=count) > 0
-    small = ((share < TINY) | ((share < SMALL) & faint)) & ~rendered
-    small[0] = False
-    return torch.from_numpy(small[labels]).to(predicted.device)
+    small = (share < ISLANDS.tiny) | ((share < ISLANDS.small) & faint)
+    removed = small & ~rendered
+    removed[0] = False  # the background
+    return torch.from_numpy(removed[labels]).to(predicted.device)
 
 
 def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
     """Colours on black, divided by their mask."""
-    return (colour / mask.clamp_min(LEAST_MASK)).clamp(0, 1)
+    return (colour / mask.clamp_min(MIN_MASK)).clamp(0, 1)

@@ -18,11 +18,13 @@ from viewmend.types import ContextViews, IncompleteView, Silhouettes
 
 Levels = Int[Tensor, "view"]
 SMALLEST_PX = 4
-"""Levels are halved until a side is no longer than this."""
+"""An image is halved until a side is no longer than this, pixels."""
 AREA_LEVEL = 2
-"""Level at which the subject's area is measured."""
-CPU_RAYS, GPU_RAYS = 1024, 16384
-"""Rays per chunk: on the CPU the samples of more rays do not fit the cache, on a GPU memory is the limit."""
+"""The subject's area is measured at this level."""
+CPU_RAYS = 1024
+"""A chunk has this many rays on the CPU: the samples of more do not fit the cache."""
+GPU_RAYS = 16384
+"""A chunk has this many rays on a GPU, where memory is the limit."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +73,32 @@ class MipLevels(NamedTuple):
     def of(cls, pyramids: Sequence["Pyramid"], levels: Sequence[int]) -> "MipLevels":
         """One level of each pyramid."""
         images = [pyramid.levels[level] for pyramid, level in zip(pyramids, levels, strict=True)]
-        sizes, device = [image.shape[0] * image.shape[1] for image in images], images[0].device
-        first, size = torch.tensor([0, *sizes[:-1]]).cumsum(0), torch.tensor([image.shape[:2] for image in images])
+        device = images[0].device
+        size = torch.tensor([image.shape[:2] for image in images])
+        count = size.prod(1)
         scale = torch.tensor([0.5**level for level in levels], dtype=torch.double)
-        pixels = torch.cat([image.flatten(0, 1) for image in images])
-        return cls(pixels, *(values.to(device) for values in (first, size[:, 1], size, scale)))
+        return cls(
+            pixels=torch.cat([image.flatten(0, 1) for image in images]),
+            first=(count.cumsum(0) - count).to(device),
+            columns=size[:, 1].to(device),
+            size=size.to(device),
+            scale=scale.to(device),
+        )
 
     @classmethod
     def full(cls, images: Shaped[Tensor, "view channel height width"]) -> "MipLevels":
         """Images at full resolution, which get their borders."""
-        bordered, device = F.pad(images, (1, 1, 1, 1)), images.device
+        bordered = F.pad(images, (1, 1, 1, 1))
         rows, columns = bordered.shape[2:]
-        view = torch.arange(images.shape[0], device=device)
-        pixels = bordered.movedim(1, 3).flatten(0, 2)
-        scale = torch.ones_like(view, dtype=torch.double)
         # len(images) would make the number of cameras of an exported model constant.
-        size = torch.tensor([[rows, columns]], device=device).expand(images.shape[0], 2)
-        return cls(pixels, view * (rows * columns), 0 * view + columns, size, scale)
+        view = torch.arange(images.shape[0], device=images.device)
+        return cls(
+            pixels=bordered.movedim(1, 3).flatten(0, 2),
+            first=view * (rows * columns),
+            columns=0 * view + columns,
+            size=torch.tensor([[rows, columns]], device=images.device).expand(images.shape[0], 2),
+            scale=torch.ones_like(view, dtype=torch.double),
+        )
 
 
 def choose_levels(
@@ -98,16 +109,29 @@ def choose_levels(
     step_px: float,
     scale: SceneScale,
 ) -> tuple[Levels, Levels]:
-    """The fine and the wide pyramid level of each source camera, for rays that are `step_px` apart in the novel view.
+    """The fine and the wide pyramid level of each source camera.
 
-    `last` is the coarsest level of each camera, and `subject_px` the root of the subject's area in it.
+    Args:
+        cameras: the source cameras.
+        last: the coarsest level of each.
+        subject_px: root of the subject's area in each.
+        viewer: the camera of the novel view.
+        step_px: distance of rays in the novel view.
+        scale: the scale of the novel view.
     """
-    pose, depth_m = viewer.world_from_camera[0].double(), torch.as_tensor(scale.depth_m, dtype=torch.double)
-    distance_m = (cameras.centers - (pose[:3, 3] + depth_m * pose[:3, 2])).square().sum(-1).sqrt().clamp_min(1e-6)
+    pose = viewer.world_from_camera[0].double()
+    depth_m = torch.as_tensor(scale.depth_m, dtype=torch.double)
+    subject_center = pose[:3, 3] + depth_m * pose[:3, 2]
+    distance_m = (cameras.centers - subject_center).square().sum(-1).sqrt().clamp_min(1e-6)
     footprint_px = step_px * depth_m / viewer.K[0, 0, 0] * cameras.K[:, 0, 0] / distance_m
-    wanted_px = footprint_px, AROUND * subject_px
-    fine, wide = (torch.minimum(px.clamp_min(1).log2().round().long(), last) for px in wanted_px)
+    fine = torch.minimum(_level_of(footprint_px), last)
+    wide = torch.minimum(_level_of(AROUND * subject_px), last)
     return fine, torch.maximum(fine, wide)
+
+
+def _level_of(pixel_size: Float[Tensor, "view"]) -> Levels:
+    """The level whose pixels are closest to this size, in pixels of the camera's image."""
+    return pixel_size.clamp_min(1).log2().round().long()
 
 
 @dataclass(frozen=True)
@@ -138,11 +162,17 @@ class SourceCameras:
             silhouettes = Silhouettes(_masks(views), views.frame.cameras)
         if context is None:
             return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
-        time, names, rig = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
+        time = views.frame.time
         device = silhouettes.mask.device
-        pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)), device)
+        pyramids = context.remembered(
+            time, "views", views.frame.cameras.names, lambda new: view_pyramids(views.select(new)), device
+        )
         masks = context.remembered(
-            time, "silhouettes", rig, lambda new: silhouette_pyramids(silhouettes.select(new)), device
+            time,
+            "silhouettes",
+            silhouettes.cameras.names,
+            lambda new: silhouette_pyramids(silhouettes.select(new)),
+            device,
         )
         return cls(views, tuple(pyramids), silhouettes, tuple(masks))
 
@@ -150,7 +180,9 @@ class SourceCameras:
     def closest_to(cls, view: IncompleteView, context: ContextProvider, count: int) -> "SourceCameras | None":
         """The source views of a view and the closest others, `count` in all; None if none is available."""
         names = view.closest_views(count)
-        views = context(view.time, names) if names else None
+        if not names:
+            return None
+        views = context(view.time, names)
         return None if views is None else cls.of(views, view.silhouettes, context)
 
     def first(self, count: int) -> "SourceCameras":
@@ -194,11 +226,15 @@ class SourceCameras:
 
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
         """The fine and the wide level of the source cameras, then those of the silhouettes."""
-        chosen = zip(self._parts, self.levels(viewer, step_px, scale), strict=True)
-        return [MipLevels.of(own, level) for (_, own), levels in chosen for level in zip(*levels, strict=True)]
+        found = []
+        for (_, pyramids), levels in zip(self._parts, self.levels(viewer, step_px, scale), strict=True):
+            fine, wide = zip(*levels, strict=True)
+            found += [MipLevels.of(pyramids, fine), MipLevels.of(pyramids, wide)]
+        return found
 
     @property
     def _parts(self) -> list[tuple[Cameras, tuple[Pyramid, ...]]]:
+        """The source cameras, and those of the silhouettes, with their pyramids."""
         return [(self.cameras, self.pyramids), (self.silhouettes.cameras, self.silhouette_pyramids)]
 
 
@@ -208,25 +244,29 @@ def source_images(
     depth: Float[Tensor, "view height width"],
 ) -> UInt8[Tensor, "view 5 height width"]:
     """RGB on black, mask, and coverage by the proxy."""
-    black = (rgb.int() * mask[:, None].int() + 127) // 255
-    return torch.cat([black.to(torch.uint8), mask[:, None], 255 * (depth > 0)[:, None].to(torch.uint8)], 1)
+    on_black = (rgb.int() * mask[:, None].int() + 127) // 255
+    coverage = 255 * (depth > 0)[:, None].to(torch.uint8)
+    return torch.cat([on_black.to(torch.uint8), mask[:, None], coverage], 1)
 
 
 def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
     """The pyramids of the `source_images` of every camera."""
-    rgb, depth = views.frame.per_camera("rgb"), views.per_camera("depth")
-    mask = views.frame.per_camera("mask") or _masks(views)
+    all_rgb = views.frame.per_camera("rgb")
+    all_masks = views.frame.per_camera("mask") or _masks(views)
+    all_depth = views.per_camera("depth")
 
     def base(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 5"]:
-        own = slice(height), slice(width)
-        parts = rgb[view][:, *own], mask[view][own], depth[view][own]
-        if parts[0].device.type != "cpu":
-            return F.pad(source_images(*(part[None] for part in parts))[0].permute(1, 2, 0), (0, 0, 1, 1, 1, 1))
+        rgb = all_rgb[view][:, :height, :width]
+        mask = all_masks[view][:height, :width]
+        depth = all_depth[view][:height, :width]
+        if rgb.device.type != "cpu":
+            image = source_images(rgb[None], mask[None], depth[None])[0]
+            return F.pad(image.permute(1, 2, 0), (0, 0, 1, 1, 1, 1))
         from viewmend.models.views._sampler_numba import premultiply
 
-        image = torch.zeros(height + 2, width + 2, 5, dtype=torch.uint8)
-        premultiply(parts[0].numpy(), parts[1].numpy(), parts[2].numpy(), image.numpy())
-        return image
+        bordered = torch.zeros(height + 2, width + 2, 5, dtype=torch.uint8)
+        premultiply(rgb.numpy(), mask.numpy(), depth.numpy(), bordered.numpy())
+        return bordered
 
     return _pyramids(views.frame.cameras, base, 3)
 
@@ -256,7 +296,9 @@ def downsample2x(image: UInt8[Tensor, "rows columns channel"]) -> UInt8[Tensor, 
 
 def _masks(views: ContextViews) -> UInt8[Tensor, "view height width"]:
     """The views' masks; what the proxy covers if they have none."""
-    return (255 * (views.depth > 0)).to(torch.uint8) if views.frame.mask is None else views.frame.mask
+    if views.frame.mask is None:
+        return (255 * (views.depth > 0)).to(torch.uint8)
+    return views.frame.mask
 
 
 def _pyramids(cameras: Cameras, base: Callable[[int, int, int], Tensor], mask: int) -> tuple[Pyramid, ...]:

@@ -27,6 +27,7 @@ from viewmend.models.views.sampler import (
     CameraFeatures,
     Rays,
     RaySamples,
+    RayStatistics,
     box_side_px,
     sample_fill_rays,
 )
@@ -40,24 +41,24 @@ Window = Float[Tensor, "pixel 8 11 11"]
 SmallestMasks = Float[Tensor, "pixel point 4"]
 """The two smallest masks of the rig at a point, and the two smallest averaged masks."""
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
-"""Points on a ray: z-depth behind the proxy, in subject sizes."""
+"""A ray is sampled at these z-depths behind the proxy, in subject sizes."""
 RADIUS_PX = 5
-"""Radius of the window around a pixel in the view."""
+"""The window around a pixel has this radius, pixels."""
 WINDOW_CHANNELS = 8
-"""RGB, M, E of the view, and RGB of the smooth fill."""
+"""A window has this many channels: RGB, M and E of the view, and RGB of the smooth fill."""
 CELLS = (0.03, 0.06)
-"""Sides, in subject sizes, of the square cells of a pixel's wider neighbourhood."""
+"""A pixel's wider neighbourhood is averaged over square cells of these sides, in subject sizes."""
 CELLS_AROUND = 5
-"""Cells to each side."""
+"""A neighbourhood has this many cells to each side of its own."""
 CELL_CHANNELS = 6
-"""RGB of the smooth fill, M, E and depth."""
+"""A cell has this many channels: RGB of the smooth fill, M, E and depth."""
 COLOUR_CHANNELS = 7
-"""What cameras that see a point agree about: colour, mean colour and mean coverage."""
+"""Cameras that see a point agree about this many channels: colour, mean colour and mean coverage."""
 POINT_FEATURES = 16
-"""Features kept of each point of a ray."""
+"""The network keeps this many features of each point of a ray."""
 PIXELS_AT_ONCE = 512
-"""Pixels per chunk without gradients: buffers for more are so large that the system allocates them page by page each
-time, which takes longer than the computation."""
+"""A chunk without gradients has this many pixels: the system allocates larger buffers page by page each time, which
+takes longer than the computation."""
 PIXELS_STEP = 64
 """Layers get a multiple of this many pixels: convolutions and GELUs are compiled and kept for each number, which would
 be slow, and fragment the memory of a server."""
@@ -79,10 +80,12 @@ class RayInputs(NamedTuple):
     def cat(parts: Sequence["RayInputs"]) -> "RayInputs":
         """Concatenation over pixels; missing cameras are padded as out of view."""
         most = max(part.features.shape[2] for part in parts)
-        first, padded = 0, []
+        first = 0
+        padded = []
         for part in parts:
             features = F.pad(part.features, (0, 0, 0, most - part.features.shape[2]))
-            padded.append(part._replace(features=features, neighbourhood_index=part.neighbourhood_index + first))
+            index = part.neighbourhood_index + first
+            padded.append(part._replace(features=features, neighbourhood_index=index))
             first += len(part.neighbourhoods)
         return RayInputs(*(torch.cat(values) for values in zip(*padded, strict=True)))
 
@@ -95,27 +98,50 @@ class RayFill(Network, Fill):
 
     def __init__(self, config: RaysConfig | None = None) -> None:
         super().__init__()
-        self.config = config = config or RaysConfig()  # pyright: ignore[reportIncompatibleVariableOverride]
-        width, points = config.width, len(OFFSETS)
+        config = config or RaysConfig()
+        self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        width = config.width
+        deep = 2 * width
+
+        # Cameras at a point
         self.look = nn.Sequential(nn.Linear(sum(CAMERA_CHANNELS), width), nn.GELU())
-        inputs = width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3
-        self.compare = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
-        self.trust = nn.Linear(width, 1)
-        inputs = width + 2 * COLOUR_CHANNELS + 5
-        self.point = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, POINT_FEATURES))
-        widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
-        layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
-        self.around = nn.Sequential(*(part for layer in layers for part in layer))
-        sizes, deep = len(CELLS), 2 * width
-        self.far = nn.Sequential(
-            *(nn.Conv2d(sizes * CELL_CHANNELS, sizes * 24, 3, groups=sizes), nn.GELU()),
-            *(nn.Conv2d(sizes * 24, sizes * width, 3, stride=2, groups=sizes), nn.GELU()),
-            *(nn.Conv2d(sizes * width, sizes * deep, 4, groups=sizes), nn.GELU()),
+        camera_inputs = width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3
+        self.compare = nn.Sequential(
+            nn.Linear(camera_inputs, width),
+            nn.GELU(),
+            nn.Linear(width, width),
+            nn.GELU(),
         )
+        self.trust = nn.Linear(width, 1)
+        point_inputs = width + 2 * COLOUR_CHANNELS + 5
+        self.point = nn.Sequential(
+            nn.Linear(point_inputs, width),
+            nn.GELU(),
+            nn.Linear(width, POINT_FEATURES),
+        )
+
+        # The surroundings of a pixel: a window, and wider neighbourhoods of two sizes
+        self.around = nn.Sequential()
+        for before, after in pairwise((WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), deep)):
+            self.around.extend([nn.Conv2d(before, after, 3), nn.GELU()])
+        sizes = len(CELLS)
+        self.far = nn.Sequential(
+            nn.Conv2d(sizes * CELL_CHANNELS, sizes * 24, 3, groups=sizes),
+            nn.GELU(),
+            nn.Conv2d(sizes * 24, sizes * width, 3, stride=2, groups=sizes),
+            nn.GELU(),
+            nn.Conv2d(sizes * width, sizes * deep, 4, groups=sizes),
+            nn.GELU(),
+        )
+
+        # The choice: it runs once per pixel, not once per point and camera, so width is cheap here.
+        points = len(OFFSETS)
         inputs = points * POINT_FEATURES + (1 + sizes) * deep
-        # Runs once per pixel, not once per point and camera: width is cheap here.
         self.head = nn.Sequential(
-            *(nn.Linear(inputs, 22 * width), nn.GELU()), *(nn.Linear(22 * width, 20 * width), nn.GELU())
+            nn.Linear(inputs, 22 * width),
+            nn.GELU(),
+            nn.Linear(22 * width, 20 * width),
+            nn.GELU(),
         )
         self.choose = nn.Linear(20 * width, points + 2)
 
@@ -139,23 +165,30 @@ class RayFill(Network, Fill):
             return self._mix(features, smallest, window, self.far(neighbourhoods).flatten(1)[index])
         size = max(1, len(index)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
         with self.autocast():
-            far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in neighbourhoods.split(size)]
-            per_pixel = features, smallest, window, torch.cat(far)[index]
+            far = [self.far(_round_up(part)).flatten(1)[: len(part)] for part in neighbourhoods.split(size)]
+            per_pixel = (features, smallest, window, torch.cat(far)[index])
             mixed = []
             for chunk in zip(*(values.split(size) for values in per_pixel), strict=True):
                 stop_if_cancelled()
-                mixed.append(self._mix(*map(_rounded_up, chunk))[: len(chunk[0])])
+                mixed.append(self._mix(*map(_round_up, chunk))[: len(chunk[0])])
             return torch.cat(mixed)
 
     def _mix(
-        self, features: Features, smallest_masks: SmallestMasks, window: Window, far: Float[Tensor, "pixel feature"]
+        self,
+        features: Features,
+        smallest_masks: SmallestMasks,
+        window: Window,
+        far: Float[Tensor, "pixel feature"],
     ) -> Float[Tensor, "pixel 3"]:
+        """The mixed colour of some pixels; `far` are the features of their neighbourhoods."""
         colours, points = self._points(features, smallest_masks)
         hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
-        candidate = F.pad(CameraFeatures.unstack(features).in_view.amax((2, 3)) > 0, (0, 2), value=True)
-        weights = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
+        in_any_view = CameraFeatures.unstack(features).in_view.amax((2, 3)) > 0
+        available = F.pad(in_any_view, (0, 2), value=True)  # the smooth fill and background always are
+        weights = self.choose(hidden).float().masked_fill(~available, -torch.inf).softmax(1)
         smooth = window[:, None, -3:, RADIUS_PX, RADIUS_PX]
-        return (weights[..., None] * torch.cat([colours, smooth, 0 * smooth], 1)).sum(1)
+        candidates = torch.cat([colours, smooth, torch.zeros_like(smooth)], 1)
+        return (weights[..., None] * candidates).sum(1)
 
     def _points(
         self, features: Features, smallest_masks: SmallestMasks
@@ -163,17 +196,22 @@ class RayFill(Network, Fill):
         """Each point's colour, by the cameras that seem to see it, and evidence for the surface being there."""
         at = CameraFeatures.unstack(features)
         colours = torch.cat([at.colour, at.mean_colour, at.mean_coverage], -1)
-        # Initial weights: cameras near the viewer that do not have the point far behind the proxy.
+
+        # Initial weights: cameras near the viewer that do not have the point far behind the proxy
         prior = at.in_view * (4 * at.viewing_cosine).exp() * (-4 * at.depth_difference).sigmoid()
         prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
         mean = (prior * colours).sum(2, keepdim=True)
         variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
-        features = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)  # the order it learned
-        looked = self.look(features)
+
+        # Compare each camera with all of them; channels are in the order that the layers were trained on.
+        ordered = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
+        looked = self.look(ordered)
         together = looked + (prior * looked).sum(2, keepdim=True)
         smallest = smallest_masks[:, :, None, ::2].expand(*prior.shape[:-1], -1)
-        inputs = [features, mean.expand_as(colours), variance.expand_as(colours), together, smallest, prior]
+        inputs = [ordered, mean.expand_as(colours), variance.expand_as(colours), together, smallest, prior]
         compared = self.compare(torch.cat(inputs, -1))
+
+        # What the trusted cameras show, and how much they agree
         scores = self.trust(compared).float() + (prior + 1e-4).log()
         trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
         agreed = (trust * colours).sum(2)
@@ -182,7 +220,7 @@ class RayFill(Network, Fill):
         return agreed[..., :3], self.point(torch.cat(point, -1))
 
 
-def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
+def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
     """The values, padded with zeros to a multiple of `PIXELS_STEP` pixels."""
     return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
@@ -191,15 +229,19 @@ def gather_ray_inputs(
     view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, guess: Image | None = None
 ) -> RayInputs:
     """The network's inputs for pixels (row, column) of a view; `guess` is the view with E filled smoothly, if made."""
-    guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
+    if guess is None:
+        guess = fill(view.rgb, view.error > 0, view.mask > 0)
     if sources is None:
-        shape = (len(pixels), len(OFFSETS))
-        features, smallest = view.depth.new_zeros(*shape, 1, sum(CAMERA_CHANNELS)), view.depth.new_ones(*shape, 4)
+        features = view.depth.new_zeros(len(pixels), len(OFFSETS), 1, sum(CAMERA_CHANNELS))
+        smallest = view.depth.new_ones(len(pixels), len(OFFSETS), 4)
     else:
-        features, _, statistics = sample_behind_proxy(view, pixels, sources)
-        smallest = statistics[..., -4:]
+        samples = sample_behind_proxy(view, pixels, sources)
+        features = samples.features
+        smallest = RayStatistics.unstack(samples.statistics).smallest_masks
     image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), (RADIUS_PX,) * 4)
-    rows, columns = (pixels[:, axis, None] + torch.arange(2 * RADIUS_PX + 1, device=image.device) for axis in (0, 1))
+    reach = torch.arange(2 * RADIUS_PX + 1, device=image.device)
+    rows = pixels[:, 0, None] + reach
+    columns = pixels[:, 1, None] + reach
     window = image[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
     return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels))
 
@@ -211,7 +253,8 @@ def sample_behind_proxy(
 
     A pixel without a depth takes it from its surroundings; the view must have a depth somewhere.
     """
-    scale, depth = SceneScale.of(view), view.depth[pixels[:, 0], pixels[:, 1]]
+    scale = SceneScale.of(view)
+    depth = view.depth[pixels[:, 0], pixels[:, 1]]
     if torch.compiler.is_exporting():
         depth = torch.where(depth > 0, depth, scale.depth_m)
     elif not bool((depth > 0).all()):
@@ -228,9 +271,12 @@ def multi_scale_context(
     Depth is relative: 0.5 at the subject's median, growing with distance, 0 where there is none. Cells meet at the
     principal point, so that a crop of a view has the same cells.
     """
+    # Sums over boxes of the view
     scale = SceneScale.of(view)
     depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
     sums = BoxSums.of(torch.cat([guess, view.mask[None], view.error[None], depth[None]])[None])
+
+    # The cells that pixels are in
     subject_px = (view.mask > 0).sum().sqrt().double()
     middle = view.camera.K[0, :2, 2].floor().long().flip(0)
     sides = [box_side_px(size, subject_px) for size in CELLS]
@@ -239,7 +285,10 @@ def multi_scale_context(
         index = torch.arange(pixels.shape[0])
     else:
         cells, index = cells.unique(dim=0, return_inverse=True)
-    reach, means = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device), []
+
+    # The means of the cells around them
+    reach = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device)
+    means = []
     for side, cell in zip(sides, cells.split(2, 1), strict=True):
         rows, columns = ((cell[:, :, None] + reach) * side - (-middle % side)[:, None]).split(1, 1)
         means.append((sums.boxes(rows, columns)[:, 0] / side**2).float().movedim(-1, 1))

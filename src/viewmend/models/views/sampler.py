@@ -20,16 +20,18 @@ from viewmend.models.views.config import AROUND, CONTRAST, FAR, FEATURES, NEAR, 
 from viewmend.models.views.pyramids import MipLevels, Pyramid, SceneScale, SourceCameras
 from viewmend.types import IncompleteView
 
-Levels = Sequence[tuple]
-"""The images of each camera, and their scales."""
+CameraImages = Sequence[tuple]
+"""The images of each camera that are sampled, and their scales."""
 CAMERA_CHANNELS = (3, 1, 1, 1, 1, 1, 1, 3, 1, 1)
-"""Channels of each field of `CameraFeatures`."""
+"""The fields of `CameraFeatures` have these numbers of channels."""
+STATISTICS_CHANNELS = (3, 3, 4)
+"""The fields of `RayStatistics` have these numbers of channels."""
 PATCH = 0.08
-"""Side, in subject sizes, of the squares over which `RayFill` averages colours: single pixels agree by chance."""
-LEAST_SHARE = 0.3
-"""`RayFill` measures the distance behind the proxy where this share of a pixel is covered by it."""
+"""`RayFill` averages colours over squares of this side, in subject sizes: single pixels agree by chance."""
+MIN_COVERAGE = 0.3
+"""`RayFill` measures the distance behind the proxy where at least this share of a pixel is covered by it."""
 BAND = 128
-"""Rays that a thread takes at a time."""
+"""A thread samples this many rays at a time."""
 
 
 class Rays(NamedTuple):
@@ -48,7 +50,7 @@ class Rays(NamedTuple):
         if size is None:
             return [self]
         parts = zip(self.uv_px.split(size), self.z_m.split(size), strict=True)
-        return [Rays(self.view, self.scale, *part) for part in parts]
+        return [Rays(self.view, self.scale, uv_px, z_m) for uv_px, z_m in parts]
 
     @property
     def origin(self) -> Float[Tensor, "3"]:
@@ -57,13 +59,21 @@ class Rays(NamedTuple):
 
     @property
     def world_from_pixel(self) -> Float[Tensor, "3 3"]:
-        """From (u, v, 1) to what a pixel's ray gains per metre of z-depth: R K^-1; ONNX has no inverse."""
+        """R K^-1, from (u, v, 1) to what a pixel's ray gains per metre of z-depth.
+
+        K^-1 is written out, because ONNX has no inverse.
+        """
         camera = self.view.camera
-        K, rotation = camera.K[0].double(), camera.camera_from_world[0, :3, :3].double().T
-        fx, skew, cx, fy, cy = K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]
-        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        rows = (1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy)), (zero, 1 / fy, -cy / fy)
-        return rotation @ torch.stack([torch.stack(row) for row in (*rows, (zero, zero, one))])
+        K = camera.K[0].double()
+        world_from_camera = camera.camera_from_world[0, :3, :3].double().T
+        (fx, skew, cx), (_, fy, cy), _ = K
+        zero = torch.zeros_like(fx)
+        inverse = [
+            torch.stack([1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy)]),
+            torch.stack([zero, 1 / fy, -cy / fy]),
+            torch.stack([zero, zero, torch.ones_like(fx)]),
+        ]
+        return world_from_camera @ torch.stack(inverse)
 
     @property
     def directions(self) -> Float[Tensor, "ray 3"]:
@@ -81,7 +91,7 @@ class RaySamples(NamedTuple):
     """Initial weights of the cameras, of `sample_rays` only: high near the viewer, and where the sample is not far
     behind the proxy. The sum is 1, or 0 where no camera has the sample in view."""
     statistics: Float[Tensor, "ray sample 10"]
-    """See `config.STATISTICS`; of `sample_fill_rays` only the masks."""
+    """`RayStatistics`, stacked; `sample_fill_rays` computes only the masks."""
 
 
 class CameraFeatures(NamedTuple):
@@ -113,92 +123,20 @@ class CameraFeatures(NamedTuple):
         return cls(*stacked.split(CAMERA_CHANNELS, -1))
 
 
-def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
-    """Samples the pyramid levels of the source cameras that match rays which are `step_px` apart.
+class RayStatistics(NamedTuple):
+    """Statistics of samples over all cameras."""
 
-    With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than bilinear ones.
-    """
-    if torch.compiler.is_exporting():
-        return sample_rays_torch(rays, sources, step_px, cubic)
-    with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
-        if not sources.use_kernels:
-            return sample_rays_torch(rays, sources, step_px, cubic)
-        levels = sources.levels(rays.view.camera, step_px, rays.scale)
-        images, outlines = map(_at_levels, (sources.pyramids, sources.silhouette_pyramids), levels)
-        return _sample_numba(rays, sources, images, outlines, 0.0, cubic)
+    mean_colour: Float[Tensor, "*sample 3"]
+    """Mean RGB by the prior weights."""
+    colour_variance: Float[Tensor, "*sample 3"]
+    """Variance of RGB by the prior weights, times `CONTRAST`."""
+    smallest_masks: Float[Tensor, "*sample 4"]
+    """The two smallest masks of the rig, and the two smallest masks averaged around the sample."""
 
-
-def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
-    """The reference of `sample_rays`."""
-    fine, wide, outline, mean_outline = sources.mips(rays.view.camera, step_px, rays.scale)
-    at, depth = project_rays(rays, sources.cameras), sources.views.depth
-    rows, columns = depth.shape[1:]
-    first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
-    surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
-    behind = torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
-    values = (sample_level_cubic if cubic else sample_level)(fine, at, 4), sample_level(wide, at, 5)
-    features = _camera_features(rays, sources, at, *values, behind, F.softsign)
-    named = CameraFeatures.unstack(features)
-    prior = named.in_view * (4 * named.viewing_cosine).exp() / (1 + (6 * named.depth_difference).exp())
-    prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
-    mean, square = ((prior * colour).sum(2) for colour in (named.colour, named.colour.square()))
-    difference = named.in_view * (named.colour - mean[:, :, None])
-    at = project_rays(rays, sources.silhouettes.cameras)
-    smallest = _smallest_masks(at, sample_level(outline, at, 1), sample_level(mean_outline, at, 1))
-    statistics = torch.cat([mean, CONTRAST * (square - mean.square()).clamp_min(0), smallest], -1)
-    return RaySamples(torch.cat([features, difference, prior], -1), prior[..., 0], statistics)
-
-
-def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
-    """Samples the source cameras at full resolution, with means over boxes."""
-    if not sources.use_kernels:
-        return _sample_fill_rays_torch(rays, sources)
-    images, masks = ([p.levels[0] for p in own] for own in (sources.pyramids, sources.silhouette_pyramids))
-    sums = (torch.tensor([int(i[..., c].sum(dtype=torch.long)) for i in own]) for own, c in ((images, 3), (masks, 0)))
-    side, half, outline_side = map(int, _box_sides(*sums))
-    boxes = [(image, 0, 3, 2, half) for image in images] + [(image, 3, 2, 1, side) for image in images]
-    boxes += [(mask, 0, 1, 1, outline_side) for mask in masks]
-    means: dict[int, np.ndarray] = {}
-    parallel_for(lambda n: means.update({n: _box_means(*boxes[n])}), len(boxes))
-    count, scales, outline_scales = len(images), (1.0, 0.5 / half, 1 / side), (1.0, 1 / outline_side)
-    views = [((image.numpy(), means[n], means[count + n]), scales) for n, image in enumerate(images)]
-    outlines = [((mask.numpy(), means[2 * count + n]), outline_scales) for n, mask in enumerate(masks)]
-    return _sample_numba(rays, sources, views, outlines, LEAST_SHARE)
-
-
-def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
-    images, depth, masks = sources.images, sources.views.depth, sources.silhouettes.mask[:, None]
-    at = project_rays(rays, sources.cameras)
-    fine = sample_level(MipLevels.full(images), at, 5)
-    share, surface = fine[..., 4], 255 * sample_level(MipLevels.full(depth[:, None]), at, 1)[..., 0]
-    behind = torch.where(share > LEAST_SHARE, at.z_m - surface / share.clamp_min(LEAST_SHARE), 0.0) / rays.scale.size_m
-    side, half, outline_side = _box_sides(images[:, 3].sum((1, 2)), masks.sum((1, 2, 3)))
-    shapes = BoxSums.of(images[:, 3:]).means(at.u_px, at.v_px, side)
-    for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
-        images = images.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
-    colours = BoxSums.of(images[:, :3]).means(at.u_px / 2, at.v_px / 2, half)
-    wide = torch.cat([colours, shapes], -1)
-    features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
-    at = project_rays(rays, sources.silhouettes.cameras)
-    means = BoxSums.of(masks).means(at.u_px, at.v_px, outline_side)
-    smallest = _smallest_masks(at, sample_level(MipLevels.full(masks), at, 1), means)
-    return RaySamples(features, 0 * features[..., 0], F.pad(smallest, (STATISTICS - 4, 0)))
-
-
-def _camera_features(
-    rays: Rays,
-    sources: SourceCameras,
-    at: "Projections",
-    fine: Float[Tensor, "ray sample view 4"],
-    wide: Float[Tensor, "ray sample view 5"],
-    behind: Float[Tensor, "ray sample view"],
-    squash: Callable[[Tensor], Tensor],
-) -> Float[Tensor, "ray sample view 14"]:
-    """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
-    single = [squash(behind / NEAR), squash(behind / FAR), viewing_cosines(rays, sources.cameras)]
-    single += [sources.is_source(rays.view.source_views).expand_as(behind), torch.ones_like(behind)]
-    features = torch.cat([fine, torch.stack([value.float() for value in single], -1), wide], -1)
-    return torch.where(at.in_view[..., None], features, 0.0)
+    @classmethod
+    def unstack(cls, stacked: Float[Tensor, "*sample 10"]) -> "RayStatistics":
+        """The fields as views of stacked statistics."""
+        return cls(*stacked.split(STATISTICS_CHANNELS, -1))
 
 
 class Projections(NamedTuple):
@@ -211,10 +149,207 @@ class Projections(NamedTuple):
     in_view: Bool[Tensor, "ray sample view"]
 
 
+class BoxSums(NamedTuple):
+    """Sums over all pixels above and left of each pixel corner (summed-area tables, Crow, SIGGRAPH 1984)."""
+
+    values: Float[Tensor, "image corner_row corner_column channel"]
+
+    @classmethod
+    def of(cls, images: Shaped[Tensor, "image channel height width"]) -> "BoxSums":
+        """The sums of these images."""
+        return cls(F.pad(images.movedim(1, 3).double(), (0, 0, 1, 0, 1, 0)).cumsum(1).cumsum(2))
+
+    def boxes(
+        self, row: Int[Tensor, "*box image row_corner"], column: Int[Tensor, "*box image column_corner"]
+    ) -> Float[Tensor, "*box image row column channel"]:
+        """Sums between neighbouring corners; corners outside an image are moved to its border."""
+        image = torch.arange(self.values.shape[0], device=row.device)[:, None, None]
+        rows, columns = self.values.shape[1:3]
+        inside_row = row.clamp(0).clamp_max(rows - 1)[..., :, None]
+        inside_column = column.clamp(0).clamp_max(columns - 1)[..., None, :]
+        corners = self.values.flatten(0, 2)[(image * rows + inside_row) * columns + inside_column]
+        return corners.diff(dim=-3).diff(dim=-2)
+
+    def means(
+        self,
+        u_px: Float[Tensor, "ray sample image"],
+        v_px: Float[Tensor, "ray sample image"],
+        side: Int[Tensor, ""],
+    ) -> Float[Tensor, "ray sample image channel"]:
+        """Means over boxes of `side` pixels, bilinear between box centres, 255 as 1; zeros outside an image."""
+        x = u_px * (1 / side.double()) - 0.5
+        y = v_px * (1 / side.double()) - 0.5
+        left = x.floor()
+        top = y.floor()
+        three_corners = torch.arange(3, device=x.device)
+        row = (top.long()[..., None] + three_corners) * side
+        column = (left.long()[..., None] + three_corners) * side
+        across = torch.stack([1 - (x - left), x - left], -1)
+        down = torch.stack([1 - (y - top), y - top], -1)
+        weights = (down[..., :, None] * across[..., None, :])[..., None]
+        return ((self.boxes(row, column) * weights).sum((-3, -2)) / (255 * side.double() ** 2)).float()
+
+
+class _Boxes(NamedTuple):
+    """Boxes over which some channels of an image with a border are averaged; see `_sampler_numba.average_boxes`."""
+
+    image: UInt8[Tensor, "rows columns channel"]
+    first: int
+    """The first channel."""
+    channels: int
+    """Number of channels."""
+    step: int
+    """1 to average every pixel, 2 for every second row and column."""
+    side: int
+    """Pixels to average per row and column."""
+
+    def means(self) -> Float[np.ndarray, "box_rows box_columns mean"]:
+        """The mean of each box, with a border of zeros."""
+        from viewmend.models.views._sampler_numba import average_boxes
+
+        rows, columns = (2 - (2 - length) // (self.step * self.side) for length in self.image.shape[:2])
+        found = np.zeros((rows, columns, self.channels), np.float32)
+        average_boxes(self.image.numpy(), self.first, self.step, self.side, found)
+        return found
+
+
+def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
+    """Samples the pyramid levels of the source cameras that match rays which are `step_px` apart.
+
+    With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than bilinear ones.
+    """
+    if torch.compiler.is_exporting():
+        return sample_rays_torch(rays, sources, step_px, cubic)
+    with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
+        if not sources.use_kernels:
+            return sample_rays_torch(rays, sources, step_px, cubic)
+        image_levels, outline_levels = sources.levels(rays.view.camera, step_px, rays.scale)
+        images = _at_levels(sources.pyramids, image_levels)
+        outlines = _at_levels(sources.silhouette_pyramids, outline_levels)
+        return _sample_numba(rays, sources, images, outlines, min_coverage=0.0, cubic=cubic)
+
+
+def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
+    """The reference of `sample_rays`."""
+    fine, wide, outline, mean_outline = sources.mips(rays.view.camera, step_px, rays.scale)
+
+    # Distance behind the proxy: the depth of the nearest pixel
+    at = project_rays(rays, sources.cameras)
+    depth = sources.views.depth
+    rows, columns = depth.shape[1:]
+    first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
+    surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
+    behind = torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
+
+    # What each camera shows
+    fine_values = sample_level_cubic(fine, at, 4) if cubic else sample_level(fine, at, 4)
+    wide_values = sample_level(wide, at, 5)
+    stacked = _camera_features(rays, sources, at, fine_values, wide_values, behind, F.softsign)
+    features = CameraFeatures.unstack(stacked)
+
+    # Prior weights, and how the cameras differ by them
+    closeness = (4 * features.viewing_cosine).exp() / (1 + (6 * features.depth_difference).exp())
+    prior = features.in_view * closeness
+    prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
+    mean = (prior * features.colour).sum(2)
+    square = (prior * features.colour.square()).sum(2)
+    variance = CONTRAST * (square - mean.square()).clamp_min(0)
+    difference = features.in_view * (features.colour - mean[:, :, None])
+
+    # The silhouettes of the whole rig
+    at_outline = project_rays(rays, sources.silhouettes.cameras)
+    masks = sample_level(outline, at_outline, 1)
+    smallest = _smallest_masks(at_outline, masks, sample_level(mean_outline, at_outline, 1))
+    statistics = torch.cat([mean, variance, smallest], -1)
+    return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
+
+
+def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
+    """Samples the source cameras at full resolution, with means over boxes."""
+    if not sources.use_kernels:
+        return _sample_fill_rays_torch(rays, sources)
+    images = [pyramid.levels[0] for pyramid in sources.pyramids]
+    masks = [pyramid.levels[0] for pyramid in sources.silhouette_pyramids]
+    mask_sums = torch.tensor([int(image[..., 3].sum(dtype=torch.long)) for image in images])
+    outline_sums = torch.tensor([int(mask.sum(dtype=torch.long)) for mask in masks])
+    shape_side, half_colour_side, outline_side = map(int, _box_sides(mask_sums, outline_sums))
+
+    # Means of all cameras over boxes: colours of every second pixel, shapes, outlines
+    boxes = [_Boxes(image, first=0, channels=3, step=2, side=half_colour_side) for image in images]
+    boxes += [_Boxes(image, first=3, channels=2, step=1, side=shape_side) for image in images]
+    boxes += [_Boxes(mask, first=0, channels=1, step=1, side=outline_side) for mask in masks]
+    means: dict[int, np.ndarray] = {}
+
+    def work(number: int) -> None:
+        means[number] = boxes[number].means()
+
+    parallel_for(work, len(boxes))
+
+    # Images and means of each camera, with the scales from its pixels to theirs
+    count = len(images)
+    scales = (1.0, 0.5 / half_colour_side, 1 / shape_side)
+    outline_scales = (1.0, 1 / outline_side)
+    views = [((image.numpy(), means[n], means[count + n]), scales) for n, image in enumerate(images)]
+    outlines = [((mask.numpy(), means[2 * count + n]), outline_scales) for n, mask in enumerate(masks)]
+    return _sample_numba(rays, sources, views, outlines, MIN_COVERAGE)
+
+
+def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
+    """The reference of `sample_fill_rays`."""
+    images = sources.images
+    depth = sources.views.depth[:, None]
+    masks = sources.silhouettes.mask[:, None]
+    shape_side, half_colour_side, outline_side = _box_sides(images[:, 3].sum((1, 2)), masks.sum((1, 2, 3)))
+
+    # Distance behind the proxy: the mean depth of the pixels around that have one
+    at = project_rays(rays, sources.cameras)
+    fine = sample_level(MipLevels.full(images), at, 5)
+    coverage = fine[..., 4]
+    surface = 255 * sample_level(MipLevels.full(depth), at, 1)[..., 0] / coverage.clamp_min(MIN_COVERAGE)
+    behind = torch.where(coverage > MIN_COVERAGE, at.z_m - surface, 0.0) / rays.scale.size_m
+
+    # What each camera shows
+    shapes = BoxSums.of(images[:, 3:]).means(at.u_px, at.v_px, shape_side)
+    half = images[:, :3]
+    for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
+        half = half.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
+    colours = BoxSums.of(half).means(at.u_px / 2, at.v_px / 2, half_colour_side)
+    wide = torch.cat([colours, shapes], -1)
+    features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
+
+    # The silhouettes of the whole rig
+    at_outline = project_rays(rays, sources.silhouettes.cameras)
+    mean_outlines = BoxSums.of(masks).means(at_outline.u_px, at_outline.v_px, outline_side)
+    smallest = _smallest_masks(at_outline, sample_level(MipLevels.full(masks), at_outline, 1), mean_outlines)
+    return RaySamples(features, 0 * features[..., 0], F.pad(smallest, (STATISTICS - smallest.shape[-1], 0)))
+
+
+def _camera_features(
+    rays: Rays,
+    sources: SourceCameras,
+    at: Projections,
+    fine: Float[Tensor, "ray sample view 4"],
+    wide: Float[Tensor, "ray sample view 5"],
+    behind: Float[Tensor, "ray sample view"],
+    squash: Callable[[Tensor], Tensor],
+) -> Float[Tensor, "ray sample view 14"]:
+    """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
+    single_channels = [
+        squash(behind / NEAR),
+        squash(behind / FAR),
+        viewing_cosines(rays, sources.cameras),
+        sources.is_source(rays.view.source_views).expand_as(behind),
+        torch.ones_like(behind),
+    ]
+    features = torch.cat([fine, torch.stack([channel.float() for channel in single_channels], -1), wide], -1)
+    return torch.where(at.in_view[..., None], features, 0.0)
+
+
 def project_lines(rays: Rays, cameras: Cameras) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
     """Homogeneous image coordinates of rays in every camera: what they gain per metre of z-depth, and their start."""
     P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
-    return rays.directions @ P[:, :, :3].mT, P[:, :, :3] @ rays.origin + P[:, :, 3]
+    linear = P[:, :, :3]
+    return rays.directions @ linear.mT, linear @ rays.origin + P[:, :, 3]
 
 
 def project_rays(rays: Rays, cameras: Cameras) -> Projections:
@@ -224,17 +359,23 @@ def project_rays(rays: Rays, cameras: Cameras) -> Projections:
     x, y, w = (per_metre[..., axis].T[:, None] * z + start[:, axis] for axis in range(3))
     front = (z > 0) & (w > 1e-6)
     safe = torch.where(front, w, 1.0)
-    u, v = x / safe, y / safe
+    u = x / safe
+    v = y / safe
     width, height = cameras.size_px.double().unbind(1)
     in_view = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    u, v, w = (torch.where(in_view, values, 0.0) for values in (u, v, w))
-    return Projections(u, v, w, in_view)
+    return Projections(
+        u_px=torch.where(in_view, u, 0.0),
+        v_px=torch.where(in_view, v, 0.0),
+        z_m=torch.where(in_view, w, 0.0),
+        in_view=in_view,
+    )
 
 
 def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample view"]:
     """Cosine of the angle at each sample between the viewer and each camera."""
     back = -rays.directions
-    offset = (cameras.centers.double() - rays.origin) + rays.z_m.double()[..., None, None] * back[:, None, None]
+    from_viewer = cameras.centers.double() - rays.origin
+    offset = from_viewer + rays.z_m.double()[..., None, None] * back[:, None, None]
     along = (offset * back[:, None, None]).sum(-1)
     lengths = (offset.square().sum(-1) * back.square().sum(-1)[:, None, None]).sqrt()
     return along / lengths.clamp_min(1e-12)
@@ -242,9 +383,12 @@ def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample v
 
 def sample_level(levels: MipLevels, at: Projections, channels: int) -> Float[Tensor, "ray sample view channel"]:
     """The first channels of each camera's image, bilinearly, 255 as 1; meaningless where a sample is not in view."""
-    x, y = at.u_px * levels.scale + 0.5, at.v_px * levels.scale + 0.5
-    left, top = x.floor(), y.floor()
-    right, below = (x - left).float()[..., None], (y - top).float()[..., None]
+    x = at.u_px * levels.scale + 0.5
+    y = at.v_px * levels.scale + 0.5
+    left = x.floor()
+    top = y.floor()
+    right = (x - left).float()[..., None]
+    below = (y - top).float()[..., None]
     corner = levels.first + top.long() * levels.columns + left.long()
     pixels = levels.pixels[:, :channels]
     upper = (1 - right) * pixels[corner] + right * pixels[corner + 1]
@@ -254,9 +398,12 @@ def sample_level(levels: MipLevels, at: Projections, channels: int) -> Float[Ten
 
 def sample_level_cubic(levels: MipLevels, at: Projections, channels: int) -> Float[Tensor, "ray sample view channel"]:
     """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
-    x, y = at.u_px * levels.scale + 0.5, at.v_px * levels.scale + 0.5
-    left, top = x.floor(), y.floor()
-    across, down = _catmull_rom((x - left).float()), _catmull_rom((y - top).float())
+    x = at.u_px * levels.scale + 0.5
+    y = at.v_px * levels.scale + 0.5
+    left = x.floor()
+    top = y.floor()
+    across = _catmull_rom((x - left).float())
+    down = _catmull_rom((y - top).float())
     pixels = levels.pixels[:, :channels]
     last_row, last_column = (levels.size - 1).unbind(1)
     total = torch.zeros(1, device=x.device)
@@ -276,38 +423,6 @@ def _catmull_rom(t: Float[Tensor, "*any"]) -> tuple[Float[Tensor, "*any"], ...]:
     return a, b, 1 - a - b - d, d
 
 
-class BoxSums(NamedTuple):
-    """Sums over all pixels above and left of each pixel corner (summed-area tables, Crow, SIGGRAPH 1984)."""
-
-    values: Float[Tensor, "image corner_row corner_column channel"]
-
-    @classmethod
-    def of(cls, images: Shaped[Tensor, "image channel height width"]) -> "BoxSums":
-        """The sums of these images."""
-        return cls(F.pad(images.movedim(1, 3).double(), (0, 0, 1, 0, 1, 0)).cumsum(1).cumsum(2))
-
-    def boxes(
-        self, row: Int[Tensor, "*box image row_corner"], column: Int[Tensor, "*box image column_corner"]
-    ) -> Float[Tensor, "*box image row column channel"]:
-        """Sums between neighbouring corners; corners outside an image are moved to its border."""
-        image = torch.arange(self.values.shape[0], device=row.device)[:, None, None]
-        rows, columns = self.values.shape[1:3]
-        row, column = row.clamp(0).clamp_max(rows - 1), column.clamp(0).clamp_max(columns - 1)
-        corners = self.values.flatten(0, 2)[(image * rows + row[..., :, None]) * columns + column[..., None, :]]
-        return corners.diff(dim=-3).diff(dim=-2)
-
-    def means(
-        self, u_px: Float[Tensor, "ray sample image"], v_px: Float[Tensor, "ray sample image"], side: Int[Tensor, ""]
-    ) -> Float[Tensor, "ray sample image channel"]:
-        """Means over boxes of `side` pixels, bilinear between box centres, 255 as 1; zeros outside an image."""
-        x, y = u_px * (1 / side.double()) - 0.5, v_px * (1 / side.double()) - 0.5
-        left, top, three = x.floor(), y.floor(), torch.arange(3, device=x.device)
-        row, column = ((corner.long()[..., None] + three) * side for corner in (top, left))
-        across, down = (torch.stack([1 - share, share], -1) for share in (x - left, y - top))
-        weights = (down[..., :, None] * across[..., None, :])[..., None]
-        return ((self.boxes(row, column) * weights).sum((-3, -2)) / (255 * side.double() ** 2)).float()
-
-
 def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
     """A length in subject sizes as whole pixels, at least 1."""
     return (size * subject_px.double()).round().clamp_min(1).long()
@@ -315,8 +430,9 @@ def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
 
 def _box_sides(mask_sums: Int[Tensor, "view"], outline_sums: Int[Tensor, "camera"]) -> tuple[Tensor, Tensor, Tensor]:
     """Sides, in pixels, of boxes of masks, of every second pixel of colours, and of silhouettes."""
-    own, rig = ((sums / 255).mean().sqrt() for sums in (mask_sums, outline_sums))
-    return box_side_px(AROUND, own), box_side_px(PATCH / 2, own), box_side_px(AROUND, rig)
+    source_px = (mask_sums / 255).mean().sqrt()
+    rig_px = (outline_sums / 255).mean().sqrt()
+    return box_side_px(AROUND, source_px), box_side_px(PATCH / 2, source_px), box_side_px(AROUND, rig_px)
 
 
 def _smallest_masks(
@@ -325,67 +441,73 @@ def _smallest_masks(
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
     found = []
     for values in (mask[..., 0], mean[..., 0]):  # ONNX has no `topk` of an unknown number of cameras
-        values = torch.where(at.in_view, values, 1.0)
-        first = values.argmin(-1, keepdim=True)
-        others = torch.where(torch.arange(values.shape[-1], device=values.device) == first, 1.0, values)
-        found += [values.amin(-1), others.amin(-1)]
+        seen = torch.where(at.in_view, values, 1.0)
+        first = seen.argmin(-1, keepdim=True)
+        others = torch.where(torch.arange(seen.shape[-1], device=seen.device) == first, 1.0, seen)
+        found += [seen.amin(-1), others.amin(-1)]
     return torch.stack(found, -1)
 
 
 def _sample_numba(
-    rays: Rays, sources: SourceCameras, images: Levels, outlines: Levels, least_share: float, cubic: bool = False
+    rays: Rays,
+    sources: SourceCameras,
+    images: CameraImages,
+    outlines: CameraImages,
+    min_coverage: float,
+    cubic: bool = False,
 ) -> RaySamples:
-    """Samples with compiled kernels; for `RayFill`, `least_share` is above 0."""
+    """Samples with compiled kernels; for `RayFill`, `min_coverage` is above 0."""
     from viewmend.models.views import _sampler_numba
 
     kernels: Any = _sampler_numba
     count, samples = rays.z_m.shape
-    channels = sum(CAMERA_CHANNELS) if least_share > 0 else FEATURES
-    names, size_m = sources.cameras.names, float(rays.scale.size_m)
+    names = sources.cameras.names
+    for_fill = min_coverage > 0
+
+    # What the kernels write
+    channels = sum(CAMERA_CHANNELS) if for_fill else FEATURES
     features = np.empty((count, samples, len(names), channels), np.float32)
-    prior, statistics = np.zeros(features.shape[:3], np.float32), np.ones((count, samples, STATISTICS), np.float32)
-    z, directions, rig = rays.z_m.float().numpy(), rays.directions.numpy(), sources.silhouettes.cameras
+    prior = np.zeros((count, samples, len(names)), np.float32)
+    statistics = np.ones((count, samples, STATISTICS), np.float32)
+    smallest_masks = statistics[..., -STATISTICS_CHANNELS[-1] :]
+
+    # What they read of rays and cameras
+    z = rays.z_m.float().numpy()
+    directions = rays.directions.numpy()
     offsets = (sources.cameras.centers.double() - rays.origin).numpy()
-    views, silhouettes = _lines(rays, sources.cameras), _lines(rays, rig)
+    views = _lines(rays, sources.cameras)
+    silhouettes = _lines(rays, sources.silhouettes.cameras)
     depths = [depth.numpy() for depth in sources.views.per_camera("depth")]
-    more = [(depth, size_m, float(name in rays.view.source_views)) for depth, name in zip(depths, names, strict=True)]
+    is_source = [float(name in rays.view.source_views) for name in names]
+    size_m = float(rays.scale.size_m)
 
     def work(band: int) -> None:
-        first, end = band * BAND, min(count, (band + 1) * BAND)
+        first = band * BAND
+        end = min(count, first + BAND)
         for n, (per_metre, start, size) in enumerate(views):
-            camera = directions, per_metre, start, offsets[n], size, *images[n], *more[n]
-            kernels.sample_camera(first, end, n, z, *camera, least_share, cubic, features, prior)
-        if channels == FEATURES:
+            line = (z, directions, per_metre, start, offsets[n], size)
+            camera = (*images[n], depths[n], size_m, is_source[n])
+            kernels.sample_camera(first, end, n, *line, *camera, min_coverage, cubic, features, prior)
+        if not for_fill:
             kernels.compare_cameras(first, end, features, prior, statistics)
         for line, own in zip(silhouettes, outlines, strict=True):
-            kernels.compare_silhouette(first, end, z, *line, *own, statistics[..., -4:])
+            kernels.compare_silhouette(first, end, z, *line, *own, smallest_masks)
 
     parallel_for(work, -(-count // BAND))
-    return RaySamples(*map(torch.from_numpy, (features, prior, statistics)))
+    return RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
 
 
 def _lines(rays: Rays, cameras: Cameras) -> list[tuple]:
     """`project_lines` and the image size of each camera."""
     per_metre, start = project_lines(rays, cameras)
-    return list(zip(per_metre.numpy(), start.numpy(), map(tuple, cameras.size_px.tolist()), strict=True))
+    sizes = [tuple(size) for size in cameras.size_px.tolist()]
+    return list(zip(per_metre.numpy(), start.numpy(), sizes, strict=True))
 
 
-def _at_levels(pyramids: Sequence[Pyramid], levels: Sequence[Sequence[int]]) -> Levels:
+def _at_levels(pyramids: Sequence[Pyramid], levels: Sequence[Sequence[int]]) -> CameraImages:
     """Two levels of each pyramid, the wide one twice as `sample_camera` takes three images, and their scales."""
     found = []
     for pyramid, (fine, wide) in zip(pyramids, levels, strict=True):
         images = tuple(pyramid.levels[level].numpy() for level in (fine, wide, wide))
         found.append((images, (0.5**fine, 0.5**wide, 0.5**wide)))
     return found
-
-
-def _box_means(
-    image: UInt8[Tensor, "rows columns channel"], first: int, count: int, step: int, side: int
-) -> Float[np.ndarray, "box_rows box_columns mean"]:
-    """Means of `count` channels over boxes, with a border of zeros; see `_sampler_numba.average_boxes`."""
-    from viewmend.models.views._sampler_numba import average_boxes
-
-    rows, columns = (2 - (2 - length) // (step * side) for length in image.shape[:2])
-    means = np.zeros((rows, columns, count), np.float32)
-    average_boxes(image.numpy(), first, step, side, means)
-    return means
