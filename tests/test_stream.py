@@ -1,5 +1,6 @@
 """Streams and their viewers: what is shared is computed once, the rest is separate."""
 
+import copy
 import itertools
 from dataclasses import dataclass, replace
 from inspect import unwrap
@@ -10,6 +11,7 @@ import torch
 from reference.ball import camera_at, photograph, proxy, ring
 from reference.forged import forged
 
+from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.frame_cache import WINDOW, cache_frame
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
@@ -18,6 +20,7 @@ from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, Stat
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import ReprojectionFill, Telea
 from viewmend.models.paper.config import paper_small
+from viewmend.models.paper.context import window_times
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.stream import Stream, StreamConfig
@@ -486,3 +489,87 @@ def test_a_geometry_that_provides_no_depth_is_refused(geometry):
     add_frame = unwrap(Stream.add_frame)  # without the checks of types
     with pytest.raises(ValueError, match=r"expected a geometry with a method depth\(cameras\), got .*; pass an object"):
         add_frame(Stream(Telea(), CONFIG), photograph(SPARSE), geometry)
+
+
+def test_a_frame_of_another_stream_is_adopted_with_all_that_was_computed(model, encoded):
+    first = Stream(model, CONFIG)
+    cached = first.add_frame(photograph(SPARSE, 0))
+    expected = first.view(A).completed.rgb
+    other = Stream(model, CONFIG)
+    known = set(encoded)
+    encoded.clear()
+    own = other.adopt(cached)
+    assert other.times == (0,) and own is not cached and own.proxy is cached.proxy
+    assert all(own.depths[name] is depth for name, depth in cached.depths.items())
+    assert torch.equal(other.view(A).completed.rgb, expected) and known and not encoded
+    # What is computed later belongs to one stream alone.
+    other.view(camera_at(320, "d"))
+    assert own.depths.keys() > cached.depths.keys()
+
+
+def test_a_frame_that_is_cached_takes_over_what_it_lacks(model):
+    first = Stream(model, CONFIG)
+    second = Stream(model, CONFIG)
+    cached = first.add_frame(photograph(SPARSE, 0))
+    own = second.add_frame(photograph(SPARSE, 0))
+    own.depth(["c0"])
+    cached.depth(["c0", "c1"])
+    before = own.depths["c0"]
+    assert second.adopt(cached) is own and own.depths["c0"] is before and own.depths["c1"] is cached.depths["c1"]
+
+
+def test_models_of_different_weights_share_a_memory(model):
+    """Each finds its own encodings there, whatever their size: in one memory, and in frames that are adopted."""
+    torch.manual_seed(1)
+    twin = PatchTransformer(model.config).eval()
+    wide = PatchTransformer(replace(model.config, dim=128)).eval()
+    first = Stream(model, CONFIG)
+    cached = first.add_frame(photograph(SPARSE, 0))
+    first.view(A)
+    for other in (twin, wide):
+        alone = Stream(other, CONFIG)
+        alone.add_frame(photograph(SPARSE, 0))
+        sharing = Stream(other, CONFIG)
+        sharing.adopt(cached)
+        assert torch.equal(sharing.view(A).completed.rgb, alone.view(A).completed.rgb)
+
+
+def test_changed_weights_get_new_encodings(model):
+    changed = copy.deepcopy(model)
+    before = changed.encoding_kind
+    assert before == model.encoding_kind
+    with torch.no_grad():
+        changed.tokeniser.linear.bias += 1
+    assert changed.encoding_kind != before
+
+
+def test_the_default_memory_holds_the_window_at_512_pixels_and_8_cameras():
+    """Of `paper-small`, with the depths and encodings of all cameras, as a moving viewer makes them."""
+    torch.manual_seed(0)
+    inpainter = PatchTransformer(paper_small()).eval()
+    frame = Studio(StudioConfig(cameras=8, frames=1, size_px=512)).read(0)
+    stream = Stream(inpainter, StreamConfig(hull=CONFIG.hull))
+    cached = stream.add_frame(frame)
+    views = cached.context(frame.cameras.names)
+    inpainter.encode_cameras(views, stream.context_provider())
+    reached = 100 - min(window_times(100, inpainter.config))
+    assert inpainter.window_frames == reached == 30
+    assert len(cached.depths) == len(cached.encoded) == 8
+    assert (1 + reached) * cached.size < 1e6 * StreamConfig().memory_mb
+
+
+def test_frames_of_the_window_are_dropped_last_and_once_with_a_warning(model, caplog):
+    """The window of `model` reaches back two frames."""
+    alone = Stream(model, CONFIG)
+    walk(alone, [0], A)
+    size_mb = 1e-6 * alone.cached_frame().size
+    enough = Stream(model, replace(CONFIG, memory_mb=3.5 * size_mb))
+    walk(enough, range(5), A)
+    enough.view(A, time=2)
+    walk(enough, [5], A)
+    assert enough.times == (3, 4, 5) and not caplog.records
+    short = Stream(model, replace(CONFIG, memory_mb=2.5 * size_mb))
+    walk(short, range(5), A)
+    assert short.times == (3, 4)
+    (record,) = caplog.records
+    assert "raise StreamConfig.memory_mb" in record.getMessage() and "2 frames" in record.getMessage()

@@ -88,7 +88,8 @@ class CachedFrame:
         new = [name for name in names if name not in self.depths]
         if new:
             rendered = self._checked_depth(self.frame.cameras.select(new))
-            right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
+            right = self.frame.rgb.shape[3] - rendered.shape[2]
+            below = self.frame.rgb.shape[2] - rendered.shape[1]
             if right or below:
                 rendered = F.pad(rendered, (0, right, 0, below))  # padded as the images are
             self.depths.update(zip(new, to_mmap(rendered), strict=True))
@@ -98,10 +99,17 @@ class CachedFrame:
         depth = self.proxy.depth(cameras)
         if isinstance(self.proxy, GeometryProxy):
             return depth
-        name, (width, height) = f"the depth of {type(self.proxy).__name__}", cameras.max_size_px
-        convert, arrange = "convert it with .float(), in metres", "give one image per camera, as large as its size_px"
-        shape = (len(cameras), height, width)
-        check_tensor(name, depth, (torch.float32,), shape, convert=convert, arrange=arrange, padded=True)
+        name = f"the depth of {type(self.proxy).__name__}"
+        width, height = cameras.max_size_px
+        check_tensor(
+            name,
+            depth,
+            (torch.float32,),
+            (len(cameras), height, width),
+            convert="convert it with .float(), in metres",
+            arrange="give one image per camera, as large as its size_px",
+            padded=True,
+        )
         check_range(name, *extremes([depth])[0], math.inf)
         return depth
 
@@ -118,13 +126,14 @@ class CachedFrame:
 
     def pop_geometry_ms(self) -> float:
         """`geometry_ms`, which is 0 afterwards."""
-        ms, self.geometry_ms = self.geometry_ms, 0.0
+        ms = self.geometry_ms
+        self.geometry_ms = 0.0
         return ms
 
     @property
     def size(self) -> int:
         """Bytes of all large tensors; recomputed only if something was added."""
-        entries = len(self.depths), len(self.encoded)
+        entries = (len(self.depths), len(self.encoded))
         if self._counted[0] != entries:
             made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
             if isinstance(self.proxy, GeometryProxy):
@@ -150,24 +159,47 @@ def cache_frame(
         )
     device = frame.rgb.device
     start = now_s(device)
-    mask, cameras = frame.mask, frame.cameras
-    if carving is not None:
-        height, width = (max(both) for both in zip(mask.shape[1:], carving.mask.shape[1:], strict=True))
-        padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (mask, carving.mask)]
-        mask, cameras = torch.cat(padded), concatenate_cameras([cameras, carving.cameras])
-    proxy = to_mmap(reconstruct(mask, cameras, bounds if bounds is None else bounds.to(device), config))
+    masks = _joined(Silhouettes(frame.mask, frame.cameras), carving)
+    own_bounds = None if bounds is None else bounds.to(device)
+    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, own_bounds, config))
     return CachedFrame(frame, proxy, ms_since(start, device))
 
 
-def evict(frames: OrderedDict[int, CachedFrame], time: int, memory_mb: float | None) -> None:
-    """Drop the least recently used frames until the others fit into `memory_mb`.
+def _joined(masks: Silhouettes, more: Silhouettes | None) -> Silhouettes:
+    """The masks of both, padded to the size of the largest."""
+    if more is None:
+        return masks
+    height = max(masks.mask.shape[1], more.mask.shape[1])
+    width = max(masks.mask.shape[2], more.mask.shape[2])
+    padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (masks.mask, more.mask)]
+    return Silhouettes(torch.cat(padded), concatenate_cameras([masks.cameras, more.cameras]))
 
-    Without a limit, drop those more than `WINDOW` frames before `time`.
+
+def evict(
+    frames: OrderedDict[int, CachedFrame], time: int, memory_mb: float | None, window_frames: int = 0
+) -> list[CachedFrame]:
+    """Drop frames until the others fit into `memory_mb`; the frame at `time` stays.
+
+    First go the least recently used of those that the window at `time`, which reaches back `window_frames`, does not
+    need; then the oldest of the window. Without a limit, all that are more than `WINDOW` frames before `time` go.
+
+    Returns:
+        What was dropped of the window.
     """
     if memory_mb is None:
         for old in [other for other in frames if other < time - WINDOW]:
             del frames[old]
-        return
+        return []
+    window = range(time - window_frames, time)
+    outside = [other for other in frames if other != time and other not in window]
+    inside = sorted(other for other in frames if other in window)
     bytes_left = sum(cached.size for cached in frames.values())
-    while bytes_left > 1e6 * memory_mb and len(frames) > 1:
-        bytes_left -= frames.popitem(last=False)[1].size
+    dropped = []
+    for old in outside + inside:
+        if bytes_left <= 1e6 * memory_mb:
+            break
+        cached = frames.pop(old)
+        bytes_left -= cached.size
+        if old in window:
+            dropped.append(cached)
+    return dropped

@@ -6,6 +6,7 @@ All commands that render, the live server and the evaluation use `Stream` (secti
 a frame is computed once and shared by all viewers; what depends on a viewer is a `State`, passed in and returned.
 """
 
+import logging
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -29,6 +30,8 @@ from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiVie
 from viewmend.utils.cancellation import stop_if_cancelled
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 
+log = logging.getLogger("viewmend")
+
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig:
@@ -46,9 +49,10 @@ class StreamConfig:
     """How views are rendered, and which of their pixels are inpainted."""
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
-    memory_mb: float | None = 1000.0
-    """Above this, the least recently used frames are dropped. None: frames are dropped once no temporal window
-    reaches back to them."""
+    memory_mb: float | None = 2000.0
+    """Above this, frames are dropped: first those that the inpainter's temporal window does not need, the least
+    recently used first. The default holds the window of `paper-small` for 8 cameras of 512 x 512 pixels, all of them
+    encoded. None: frames are dropped once no temporal window reaches back to them."""
 
     def __post_init__(self) -> None:
         if self.background not in get_args(Background):
@@ -125,6 +129,8 @@ class Stream:
         self.bounds = bounds
         self.error_model = error_model
         self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
+        self._warned = False
+        """Whether a warning has said that the memory does not hold the window."""
 
     @property
     def error_rule(self) -> str:
@@ -169,12 +175,50 @@ class Stream:
                 carving.check()
             if geometry is not None:
                 check_provider(geometry)
-            frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
-            given = None if geometry is None else CachedFrame(frame, geometry)
-            self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull, carving)
-        self._frames.move_to_end(frame.time)
-        evict(self._frames, frame.time, self.config.memory_mb)
+            images = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
+            if geometry is None:
+                self._frames[frame.time] = cache_frame(images, self.bounds, self.config.hull, carving)
+            else:
+                self._frames[frame.time] = CachedFrame(images, geometry)
+        self._use(frame.time)
         return self._frames[frame.time]
+
+    def adopt(self, cached: CachedFrame) -> CachedFrame:
+        """Add a frame that another stream has prepared, with its geometry and everything computed from it so far.
+
+        Nothing is copied, and nothing that is computed later is shared. A frame whose time is cached already is not
+        replaced, but it takes over the depths and encodings that it does not have yet.
+
+        Args:
+            cached: the frame, on the device on which this stream's views are rendered.
+
+        Raises:
+            ValueError: as `add_frame`.
+        """
+        own = self.add_frame(cached.frame, cached.proxy)
+        own.depths = cached.depths | own.depths
+        own.encoded = cached.encoded | own.encoded
+        self._use(cached.frame.time)
+        return own
+
+    def _use(self, time: int) -> None:
+        """Mark a frame as the one used last, and drop frames beyond the memory.
+
+        The first time that this cuts the inpainter's window, a warning says so.
+        """
+        self._frames.move_to_end(time)
+        dropped = evict(self._frames, time, self.config.memory_mb, self.inpainter.window_frames)
+        if dropped and not self._warned:
+            self._warned = True
+            needed_mb = (1 + self.inpainter.window_frames) * max(cached.size for cached in dropped) / 1e6
+            log.warning(
+                "expected memory for the %d frames that the window of %s reaches back, about %.0f MB, got %g MB; the "
+                "oldest of them are dropped; raise StreamConfig.memory_mb (viewmend serve: --memory-mb, twice as much)",
+                self.inpainter.window_frames,
+                type(self.inpainter).__name__,
+                needed_mb,
+                self.config.memory_mb,
+            )
 
     def cached_frame(self, time: int | None = None) -> CachedFrame:
         """The frame of this index, by default the latest.
@@ -298,10 +342,12 @@ class Stream:
             got = type(cached.proxy).__name__
             raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself, and use mend")
         margin_px = self.inpainter.crop_margin_px(quality)
-        margin = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
-        crop = mesh_crop(cached.proxy.mesh.vertices, target, *margin)
-        camera, depth = crop.of_camera(target), cached.depth
-        part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, depth)
+        if margin_px is None:
+            crop = mesh_crop(cached.proxy.mesh.vertices, target, BORDER_PX, 1)
+        else:
+            crop = mesh_crop(cached.proxy.mesh.vertices, target, margin_px, grid_px(margin_px))
+        camera = crop.of_camera(target)
+        part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, cached.depth)
         if target_mask is not None:
             part = replace(part, target_mask=crop.of_image(target_mask).clamp(0, 1))
         return part, evidence, crop
@@ -313,12 +359,24 @@ class Stream:
 
         Without evidence E is only limited by the quality.
         """
-        by_rule = evidence is not None and self.error_rule == "predicted"
-        fractions = (quality.refine_fraction, self.config.render.refine_fraction if by_rule else None)
-        fraction = min((own for own in fractions if own is not None), default=None) if quality.mend else None
+        fraction = self._refine_fraction(quality, by_rule=evidence is not None)
         context = self.context_provider(RenderQuality(refine_fraction=fraction), exclude)
-        view = decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
-        return view, context.encoding_ms
+        masked = decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
+        return masked, context.encoding_ms
+
+    def _refine_fraction(self, quality: RenderQuality, by_rule: bool) -> float | None:
+        """The largest fraction of the subject's pixels to inpaint; None for no limit.
+
+        The quality may limit it and, with the rule 'predicted', the configuration; the smaller one counts.
+        """
+        if not quality.mend:
+            return None
+        limits = []
+        if quality.refine_fraction is not None:
+            limits.append(quality.refine_fraction)
+        if by_rule and self.error_rule == "predicted":
+            limits.append(self.config.render.refine_fraction)
+        return min(limits, default=None)
 
     def _complete(
         self,
@@ -333,25 +391,34 @@ class Stream:
         target: Cameras | None = None,
     ) -> StreamView:
         """Complete a part of a view, and paste it into `whole`, or into an empty view of `target`."""
-        cached, viewer = self.cached_frame(part.time), self.viewer() if viewer is None else viewer
+        cached = self.cached_frame(part.time)
         context = self.context_provider(quality, exclude)
         start = now_s(part.rgb.device)
+
+        # decide which pixels are to be inpainted
         stop_if_cancelled()
-        part, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
+        masked, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
         stop_if_cancelled()
         if target is not None and self.inpainter.crop_margin_px(quality) is None:
-            part, crop = crop.uncropped(part, target), Crop.all_of(target)
-        completed = CompletedView(part, part.cut_rgb)
+            masked = crop.uncropped(masked, target)
+            crop = Crop.all_of(target)
+
+        # inpaint them
+        completed = CompletedView(masked, masked.cut_rgb)
+        state = self.viewer() if viewer is None else viewer
         if quality.mend:
             with heavy_operations():
-                completed, viewer = self.inpainter.step_on(self.config.background, part, context, viewer)
+                completed, state = self.inpainter.step_on(self.config.background, masked, context, state)
         encoding_ms += context.encoding_ms
-        inpainting_ms = ms_since(start, part.rgb.device) - encoding_ms if quality.mend else 0.0
-        completed = crop.pasted(completed, whole or crop.uncropped(part, target or part.camera))
-        self._frames.move_to_end(part.time)
-        evict(self._frames, part.time, self.config.memory_mb)
+        inpainting_ms = ms_since(start, masked.rgb.device) - encoding_ms if quality.mend else 0.0
+
+        # put the part into the whole view
+        if whole is None:
+            whole = crop.uncropped(masked, target or masked.camera)
+        completed = crop.pasted(completed, whole)
+        self._use(part.time)
         times = StageTimes(geometry=cached.pop_geometry_ms(), context=encoding_ms, inpainting=inpainting_ms)
-        return StreamView(completed, viewer, times)
+        return StreamView(completed, state, times)
 
     def context_provider(self, quality: RenderQuality | None = None, exclude: Sequence[str] = ()) -> ContextProvider:
         """The cameras of all frames in memory, except `exclude`, and what was computed from them."""

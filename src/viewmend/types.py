@@ -25,19 +25,20 @@ from viewmend.geometry.hull import FOREGROUND
 from viewmend.utils.tensors import OnDevice, check_tensor, extremes
 
 RIM_PX = 2
-"""How far the subject may extend beyond the proxy, pixels: silhouettes and grids cut off up to this much."""
+"""The subject may extend this many pixels beyond the proxy, because masks and voxel grids cut it off."""
 FAINT = 1 / 16
-"""Opacity below which a pixel's colour divided by its opacity is noise."""
+"""A pixel's colour divided by its opacity is noise if the opacity is below this."""
 NEAR_PX = 4
-"""Radius within which faint pixels take the colour of their neighbours."""
-
+"""Faint pixels take the mean colour of their neighbours up to this many pixels away."""
 OVERSHOOT = 0.4
-"""How far images in [0, 1] may leave it, as those of renderers and networks do."""
+"""Images in [0, 1] may leave this range by this much, as those of renderers and networks do."""
 SUM_TOLERANCE = 1e-2
-"""Of s (1 - s), with s the sum of a pixel's weights."""
+"""Each pixel's weights have a sum s of 0 or 1; s (1 - s) may differ from 0 by this much."""
 NOISE = 0.01
-"""Masks with at most this share of ones, and nothing above, are those of no subject, as a matting leaves them."""
+"""Masks of values 0 and 1 (of 255) show no subject, but a matting's noise, if at most this fraction of the pixels
+is 1; if more are, they were probably made with values from 0 to 1."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
+"""Messages about images of another type than float32 suggest this."""
 
 
 class _LazyStacks:
@@ -114,17 +115,26 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         cameras = self.cameras.select(names)
         index = [self.cameras.names.index(name) for name in names]
         if not names:
-            mask, depth = (None if image is None else image[:0] for image in (self.mask, self.depth))
+            mask = None if self.mask is None else self.mask[:0]
+            depth = None if self.depth is None else self.depth[:0]
             return replace(self, cameras=cameras, rgb=self.rgb[:0], mask=mask, depth=depth)
         width, height = cameras.max_size_px  # a stack is as large as its largest image
-        found = {
-            name: [images[i][..., :height, :width] for i in index]
-            for name in ("rgb", "mask", "depth")
-            if (images := self.per_camera(name))
-        }
-        depth = torch.stack(found.pop("depth")) if "depth" in found else None
-        absent = {} if "mask" in found else {"mask": None}
-        return MultiViewFrame._of_parts(found, cameras=cameras, time=self.time, depth=depth, **absent)
+
+        def selected(field: str) -> list[Tensor]:
+            """The images of a field, cut to their largest size; empty if the field is None."""
+            images = self.per_camera(field)
+            return [images[i][..., :height, :width] for i in index] if len(images) else []
+
+        own: dict[str, Any] = {"cameras": cameras, "time": self.time, "mask": None, "depth": None}
+        parts = {"rgb": selected("rgb")}
+        masks = selected("mask")
+        if masks:
+            parts["mask"] = masks
+            del own["mask"]  # stacked when it is read
+        depths = selected("depth")
+        if depths:
+            own["depth"] = torch.stack(depths)
+        return MultiViewFrame._of_parts(parts, **own)
 
     def check(self) -> None:
         """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1."""
@@ -307,18 +317,31 @@ class IncompleteView:
 
     def _check_images(self, height: int, width: int) -> None:
         """The checks of the images but `target_mask`: their types and shapes, then their ranges."""
-        channels = {"rgb": (3,), "weights": (len(self.source_views),), "mask": (), "error": (), "depth": ()}
+        plane = (height, width)
+        shapes = {
+            "rgb": (3, *plane),
+            "weights": (len(self.source_views), *plane),
+            "mask": plane,
+            "error": plane,
+            "depth": plane,
+        }
+        if self.fade is not None:
+            shapes["fade"] = plane
+
+        # types and shapes
         images: dict[str, Tensor] = {}
-        for name, more in (channels | ({} if self.fade is None else {"fade": ()})).items():
+        for name, shape in shapes.items():
             what = "one image for each of source_views" if name == "weights" else "it channels first"
-            arrange, value = f"give {what}, at the size of the view's camera", getattr(self, name)
-            shape = (*more, height, width)
+            arrange = f"give {what}, at the size of the view's camera"
+            value = getattr(self, name)
             images[name] = check_tensor(name, value, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
+
+        # ranges
         sums = self.weights.sum(0)
-        off = sums * (1 - sums)  # 0 where the sum is 0 or 1
-        *ranges, (low, high) = extremes([*images.values(), off])
-        for name, pair in zip(images, ranges, strict=True):
-            check_range(name, *pair, most=math.inf if name == "depth" else 1.0)
+        off_by = sums * (1 - sums)  # 0 where the sum is 0 or 1
+        *ranges, (low, high) = extremes([*images.values(), off_by])
+        for name, (smallest, largest) in zip(images, ranges, strict=True):
+            check_range(name, smallest, largest, most=math.inf if name == "depth" else 1.0)
         if low < -SUM_TOLERANCE or high > SUM_TOLERANCE:
             raise ValueError("expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum")
 
@@ -387,7 +410,8 @@ class CompletedView:
         opacity = self.opacity[None]
         near = F.avg_pool2d(torch.cat([self.rgb, opacity])[None], 2 * NEAR_PX + 1, 1, NEAR_PX)[0]
         tiny = torch.finfo(near.dtype).tiny
-        spread, own = near[:3] / near[3:].clamp(min=tiny), self.rgb / opacity.clamp(min=FAINT)
+        spread = near[:3] / near[3:].clamp(min=tiny)
+        own = self.rgb / opacity.clamp(min=FAINT)
         return torch.where(opacity < FAINT, spread, own).clamp(0, 1)
 
     @property

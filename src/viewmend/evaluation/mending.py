@@ -74,7 +74,7 @@ class Mender:
             self._warm_up = Stream(own.inpainter, own.config, own.bounds, own.error_model)
         for stream in (own,) if self._warm_up is None else (self._warm_up, own):
             if isinstance(frame, CachedFrame):
-                stream.add_frame(given, frame.proxy).depths.update(frame.depths)
+                stream.adopt(frame)
             else:
                 stream.add_frame(given, carving=carving)
         return own.cached_frame(given.time)

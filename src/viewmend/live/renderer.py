@@ -270,7 +270,7 @@ class Renderer:
     ) -> CompletedView:
         """The view by another model, behind the same geometry."""
         stream = self._stream_of(model, without)
-        stream.add_frame(cached.frame, cached.proxy).depths = cached.depths
+        stream.adopt(cached)
         return stream.view(camera, None, cached.frame.time, replace(quality, mend=True)).completed
 
     def _true_frame(self, index: int, name: str) -> MultiViewFrame:
@@ -320,10 +320,10 @@ class Renderer:
         if shared is None:
             return stream.add_frame(self._read(index))
         assert isinstance(shared.proxy, GeometryProxy), "shared frames have hulls"
-        cached = stream.add_frame(shared.frame.to(self._device), shared.proxy.to(self._device))
-        if self._device == "cpu":  # on a GPU, camera images are encoded when they are used
-            cached.depths, cached.encoded = shared.depths | cached.depths, shared.encoded | cached.encoded
-        return cached
+        if self._device == "cpu":
+            return stream.adopt(shared)
+        # on a GPU, camera images are encoded when they are used
+        return stream.add_frame(shared.frame.to(self._device), shared.proxy.to(self._device))
 
     def _view(self, stream: Stream, camera: Cameras, viewer: State, index: int, quality: RenderQuality) -> StreamView:
         """One view; with its holes if the model fails."""

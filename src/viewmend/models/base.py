@@ -23,8 +23,8 @@ from viewmend.utils.timing import ms_since, now_s
 ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
 """views(time, names): the cameras of these names in the frame `time`, with the proxy's depth. Cameras without an image
 in that frame are left out; None if all are."""
-Memory = dict[Any, Any]
-"""What was computed from one frame: encoded images by camera name, everything else by (kind, camera name)."""
+Memory = dict[tuple[str, str], Any]
+"""What was computed from one frame, by (kind, camera name)."""
 T = TypeVar("T")
 REMEMBERED_FRAMES = 34
 """Frames that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
@@ -114,23 +114,40 @@ class ContextProvider:
         return self._views(time, names) if names else None
 
     def encoded(
-        self, times: Sequence[int], names: Sequence[str], encode: Callable[[list[ContextViews]], Sequence[Sequence]]
+        self,
+        times: Sequence[int],
+        names: Sequence[str],
+        encode: Callable[[list[ContextViews]], Sequence[Sequence]],
+        kind: str = "encoded",
     ) -> list[Any]:
         """The encodings of these cameras in these frames, in the order of frames and then of names.
 
         Cameras without an image are left out. `encode` is called once, with every frame that has cameras which are not
         in the memory yet; it returns one result per camera for each element of its argument.
+
+        Args:
+            times: indices of the frames.
+            names: the cameras.
+            encode: computes the encodings.
+            kind: distinguishes the encodings from those of other models in the same memory (`Network.encoding_kind`).
         """
-        names = [name for name in names if name not in self._exclude]
+        usable = [name for name in names if name not in self._exclude]
         memories = {time: self._memory(time) for time in times}
-        absent = [self(time, [n for n in names if n not in memory]) for time, memory in memories.items()]
-        new = [views for views in absent if views is not None and len(views.frame.cameras)]
+
+        # encode the cameras that are missing, of all frames in one call
+        new = []
+        for time, memory in memories.items():
+            views = self(time, [name for name in usable if (kind, name) not in memory])
+            if views is not None and len(views.frame.cameras):
+                new.append(views)
         if new:
-            with self._timed(new[0].depth.device):
+            with self._timed(new[0].frame.cameras.K.device):
                 for views, results in zip(new, encode(new), strict=True):
-                    pairs = zip(views.frame.cameras.names, results, strict=True)
-                    memories[views.frame.time].update({name: to_mmap(result) for name, result in pairs})
-        return [memory[name] for memory in memories.values() for name in names if name in memory]
+                    memory = memories[views.frame.time]
+                    for name, result in zip(views.frame.cameras.names, results, strict=True):
+                        memory[kind, name] = to_mmap(result)
+
+        return [memory[kind, name] for memory in memories.values() for name in usable if (kind, name) in memory]
 
     def remembered(
         self,
@@ -153,13 +170,15 @@ class ContextProvider:
         absent = [name for name in names if (kind, name) not in memory]
         if absent:
             with self._timed(device):
-                memory.update({(kind, n): to_mmap(made) for n, made in zip(absent, make(absent), strict=True)})
+                for name, made in zip(absent, make(absent), strict=True):
+                    memory[kind, name] = to_mmap(made)
         return [memory[kind, name] for name in names]
 
     @contextmanager
     def _timed(self, device: torch.device) -> Iterator[None]:
         """Add the time of the `with` block to `encoding_ms`; that of blocks within it is not added twice."""
-        before, start = self.encoding_ms, now_s(device)
+        before = self.encoding_ms
+        start = now_s(device)
         yield
         self.encoding_ms = before + ms_since(start, device)
 
@@ -213,6 +232,8 @@ class Inpainter:
     """The background that its output is painted on. None: the background of its input, as for classical fills."""
     predicts_errors: bool = False
     """Whether `predict_errors` is implemented."""
+    window_frames: int = 0
+    """How many frames back `step` asks its context for. A stream keeps these frames, if its memory holds them."""
 
     def initial_state(self) -> State:
         """The state before the first view of a viewer."""

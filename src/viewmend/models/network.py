@@ -1,5 +1,6 @@
 """Base class of all networks, and the precision that they compute in."""
 
+import hashlib
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -20,6 +21,23 @@ class Network(nn.Module, Inpainter):
     trained_in_bfloat16 = False
     """Whether the model was trained in bfloat16, and so is as good in it as in float32."""
     background: Background | None = "black"
+
+    _encoding_kind: tuple[int, str] = (-1, "")
+    """How often the weights had been changed when `encoding_kind` was last computed, and its value."""
+
+    @property
+    def encoding_kind(self) -> str:
+        """A name for this model's encodings in a frame's memory: a digest of its weights, the same in all processes.
+
+        Models of different weights may share a memory, and so must not find each other's encodings there.
+        """
+        weights = list(self.parameters())
+        version = sum(weight._version for weight in weights if not weight.is_inference())
+        if self._encoding_kind[0] != version:
+            digest = hashlib.sha256(str([tuple(weight.shape) for weight in weights]).encode())
+            digest.update(torch.cat([weight.detach().flatten() for weight in weights]).cpu().numpy().data)
+            self._encoding_kind = (version, digest.hexdigest()[:16])
+        return self._encoding_kind[1]
 
     def autocast(self) -> AbstractContextManager[object]:
         """A context in which layers compute in `compute_dtype`; no autocast while `torch.export` traces."""

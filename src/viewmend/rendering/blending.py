@@ -14,9 +14,9 @@ from viewmend.geometry.threads import parallel_for
 from viewmend.types import ContextViews
 
 GRAZING = 0.1
-"""Cosine below which the slope term of the depth test stays constant."""
+"""The slope term of the depth test stays constant below this cosine between normal and camera."""
 ROWS = 16
-"""Rows of the novel view per thread task on the CPU; few, because the subject fills only some of them."""
+"""A thread's task on the CPU has this many rows of the novel view; few, because the subject fills only some."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,28 +76,40 @@ def blend(
         return blend_torch(camera, depth, normals, sources, bias_m, config)
     from viewmend.rendering._blend_numba import blend_rows
 
-    frame, rig = sources.frame, sources.frame.cameras
+    frame = sources.frame
+    rig = frame.cameras
     height = len(depth)
-    rgb, weights = torch.zeros(3, *depth.shape), torch.zeros(len(rig), *depth.shape)
-    disagreement = torch.zeros(depth.shape)
+
+    # the novel view's rays, and the cameras' projections
     pose = camera.world_from_camera[0].double()
-    world_from_pixel = (pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())).numpy()
-    P = (rig.K.double() @ rig.camera_from_world[:, :3].double()).numpy()
+    world_from_pixel = pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())
+    P = rig.K.double() @ rig.camera_from_world[:, :3].double()
     mask = torch.zeros(0, 0, 0, dtype=torch.uint8) if frame.mask is None else frame.mask
     inputs = (
-        *(depth.numpy(), normals.numpy(), world_from_pixel, pose[:3, 3].numpy()),
-        *(frame.rgb.numpy(), mask.numpy(), sources.depth.numpy()),
-        *(P, rig.centers.double().numpy(), rig.K[:, 0, 0].double().numpy(), rig.size_px.numpy()),
+        depth.numpy(),
+        normals.numpy(),
+        world_from_pixel.numpy(),
+        pose[:3, 3].numpy(),
+        frame.rgb.numpy(),
+        mask.numpy(),
+        sources.depth.numpy(),
+        P.numpy(),
+        rig.centers.double().numpy(),
+        rig.K[:, 0, 0].double().numpy(),
+        rig.size_px.numpy(),
         np.array([bias_m, config.slope_px, GRAZING]),
         np.array([config.normal_power, config.view_power]),
     )
-    outputs = (rgb.numpy(), weights.numpy(), disagreement.numpy())
+
+    # bands of rows, shared among the threads
+    blended = Blend(torch.zeros(3, *depth.shape), torch.zeros(len(rig), *depth.shape), torch.zeros(depth.shape))
+    outputs = (blended.rgb.numpy(), blended.weights.numpy(), blended.disagreement.numpy())
 
     def work(band: int) -> None:
         blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
 
     parallel_for(work, -(-height // ROWS))
-    return Blend(rgb, weights, disagreement)
+    return blended
 
 
 def blend_torch(

@@ -12,10 +12,11 @@ from viewmend.geometry.cameras import Cameras, project
 from viewmend.types import CompletedView, IncompleteView
 
 BORDER_PX = 2
-"""Margin of a rendered crop around the subject's vertices."""
+"""A rendered crop extends this many pixels beyond the subject's vertices."""
 PATCH_STEP_PX = 16
-"""Patches of a crop lie as in the whole view if the crop begins at a multiple of this."""
+"""The patches of a crop lie as in the whole view if it begins at a multiple of this many pixels."""
 NEAR_M = 1e-3
+"""A view whose camera has a vertex nearer than this, in metres, or behind it, is not cropped."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Crop:
         """This part of a view."""
         if self == Crop.all_of(view.camera):
             return view
-        parts = {name: self.of_image(image).contiguous() for name, image in _images(view).items()}
-        return replace(view, camera=self.of_camera(view.camera), **parts)
+        images = {name: self.of_image(image).contiguous() for name, image in _images(view).items()}
+        return replace(view, camera=self.of_camera(view.camera), **images)
 
     def uncropped(self, part: IncompleteView, camera: Cameras) -> IncompleteView:
         """The whole view of `camera`: black, and without subject, around this part."""
@@ -60,14 +61,14 @@ class Crop:
         """`view` completed by this part of it, whose error mask becomes the view's. Other pixels keep their colour."""
         if self == Crop.all_of(view.camera):
             return part
-        camera, images = view.camera, part.images
-        images = {name: self._padded(image, camera) for name, image in images.items() if name != "rgb"}
-        fade = None if part.view.fade is None else self._padded(part.view.fade, camera)
-        whole, rgb = replace(view, error=self._padded(part.view.error, camera), fade=fade), view.cut_rgb
+        images = {name: self._padded(image, view.camera) for name, image in part.images.items() if name != "rgb"}
+        error = self._padded(part.view.error, view.camera)
+        fade = None if part.view.fade is None else self._padded(part.view.fade, view.camera)
+        rgb = view.cut_rgb
         if part.rgb is not part.view.rgb:
             rgb = rgb.clone()
             self.of_image(rgb).copy_(part.rgb)
-        return CompletedView(whole, rgb, **images)
+        return CompletedView(replace(view, error=error, fade=fade), rgb, **images)
 
     def _padded(self, image: Tensor, camera: Cameras) -> Tensor:
         width, height = camera.max_size_px
@@ -77,7 +78,8 @@ class Crop:
 def _images(view: IncompleteView) -> dict[str, Tensor]:
     """The image fields of a view that are not None."""
     fields = ("rgb", "mask", "error", "depth", "weights", "fade", "target_mask")
-    return {name: image for name in fields if (image := getattr(view, name)) is not None}
+    images = {name: getattr(view, name) for name in fields}
+    return {name: image for name, image in images.items() if image is not None}
 
 
 def mesh_crop(
@@ -93,9 +95,10 @@ def mesh_crop(
     if bool((z < NEAR_M).any()):
         return Crop.all_of(camera)
     width, height = camera.max_size_px
-    (u0, v0), (u1, v1) = (corner[0].tolist() for corner in (uv.amin(1), uv.amax(1)))
-    left, right = _side(u0 - margin_px, u1 + margin_px, width, grid_px)
-    top, bottom = _side(v0 - margin_px, v1 + margin_px, height, grid_px)
+    first_u, first_v = uv[0].amin(0).tolist()
+    last_u, last_v = uv[0].amax(0).tolist()
+    left, right = _side(first_u - margin_px, last_u + margin_px, width, grid_px)
+    top, bottom = _side(first_v - margin_px, last_v + margin_px, height, grid_px)
     return Crop(left, top, right, bottom)
 
 
@@ -103,7 +106,8 @@ def subject_crop(view: IncompleteView, margin_px: int) -> Crop:
     """The part of a view with M or E above 0, and at least this margin; the whole view if there is no such pixel."""
     height, width = view.mask.shape
     subject = (view.mask > 0) | (view.error > 0)
-    rows, columns = (torch.nonzero(subject.any(axis))[:, 0] for axis in (1, 0))
+    rows = torch.nonzero(subject.any(1))[:, 0]
+    columns = torch.nonzero(subject.any(0))[:, 0]
     if not len(rows):
         return Crop.all_of(view.camera)
     grid = grid_px(margin_px)

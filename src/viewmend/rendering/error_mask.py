@@ -20,11 +20,11 @@ from viewmend.types import RIM_PX, IncompleteView
 from viewmend.utils.plugins import load_from_file
 
 MIN_WEIGHT = 1e-5
-"""Sum of raw weights below which a pixel has no colour (RIFTCast)."""
+"""A pixel has no colour if the sum of its raw weights is below this (RIFTCast)."""
 MIN_GAIN = 0.01**2
-"""Pixels whose colour is predicted to change by less are never selected."""
+"""A pixel is never selected if its predicted gain, the squared change of its colour, is below this."""
 MIN_FADE = 0.02
-"""Pixels of a smaller predicted background fraction are not attenuated."""
+"""A pixel is not attenuated if its predicted background fraction is below this."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,8 @@ def _apply_rule(name: str, evidence: Evidence) -> Float[Tensor, "height width"]:
             "def NAME(evidence)"
         ) from error
     E = rule(evidence)
-    if fault := _fault(E, evidence):
+    fault = _fault(E, evidence)
+    if fault is not None:
         raise ValueError(
             f"error rule '{name}': expected E as floats of shape {tuple(evidence.mask.shape)} in [0, 1], 1 in all "
             f'holes, got {fault}; begin with torch.maximum(error_rule("holes")(evidence), ...)'

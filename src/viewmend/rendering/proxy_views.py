@@ -14,24 +14,25 @@ from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.types import ContextViews
 
 CLAY = (0.86, 0.83, 0.79)
-"""RGB of the surface where it faces the viewer."""
+"""The surface has this colour, RGB in [0, 1], where it faces the viewer."""
 GRAZING = 0.18
-"""Relative brightness of the surface at grazing angles."""
+"""The surface has this brightness at grazing angles, relative to where it faces the viewer."""
 DOT = 0.7
-"""A dot's side, relative to the distance between neighbouring vertices."""
+"""A dot's side is this many times the distance between neighbouring vertices."""
 MAX_DOT_PX = 32
+"""A dot's side has at most this many pixels."""
 BEHIND = 1.5
-"""Vertices further behind the visible surface than this are hidden, in distances between neighbouring vertices."""
+"""A vertex is hidden if it lies this far behind the visible surface, in distances between neighbouring vertices."""
 FRONTAL_POWER = 4
-"""Exponent of the cosine between a vertex's normal and the direction to a camera."""
+"""A camera's weight at a vertex is this power of the cosine between the normal and the direction to the camera."""
 BIAS = 0.01
-"""A vertex is hidden if it lies this far behind the proxy's depth, relative to the diagonal of the hull's bounds."""
+"""A vertex is hidden if it lies this far behind the proxy's depth, as a fraction of the diagonal of the hull's box."""
 MIN_MASK = 0.5
-"""Foreground fraction of a sample below which it is ignored."""
+"""A sample is ignored if its foreground fraction is below this."""
 MIN_WEIGHT = 1e-4
-"""Total weight below which a vertex counts as unseen."""
+"""A vertex counts as unseen if the sum of its cameras' weights is below this."""
 GREY = 0.5
-"""Colour of vertices that are not connected to any that a camera sees."""
+"""Vertices that are not connected to any that a camera sees have this grey level, in [0, 1]."""
 
 
 def shaded_hull(proxy: GeometryProxy, camera: Cameras) -> Float[Tensor, "4 height width"]:
@@ -58,13 +59,14 @@ def hull_points(
         first, second = mesh.vertices[mesh.faces[:, :2].long()].unbind(1)
         apart_m = float((first - second).norm(dim=-1).median())
         uv, z = project(mesh.vertices, camera)
-        column, row = (uv[0, :, axis].long().clamp(0, most - 1) for axis, most in ((0, width), (1, height)))
+        column = uv[0, :, 0].long().clamp(0, width - 1)
+        row = uv[0, :, 1].long().clamp(0, height - 1)
         surface = proxy.depth(camera)[0][row, column]
         visible = in_view(uv, z, camera)[0] & ((surface == 0) | (z[0] <= surface + BEHIND * apart_m))
         order = torch.where(visible, z[0], 0.0).argsort(descending=True)[: int(visible.sum())]  # the farthest first
-        sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(1, MAX_DOT_PX)
+        sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(1, MAX_DOT_PX).long()
         rgba = torch.cat([colours, torch.ones_like(colours[:, :1])], 1)[order]
-        _draw(image, *(values.cpu().numpy() for values in (row[order], column[order], sides.long(), rgba)))
+        _draw(image, row[order].cpu().numpy(), column[order].cpu().numpy(), sides.cpu().numpy(), rgba.cpu().numpy())
     return torch.from_numpy(image).movedim(-1, 0).to(colours)
 
 
@@ -73,10 +75,12 @@ def vertex_colours(proxy: GeometryProxy, views: ContextViews) -> Float[Tensor, "
 
     Unseen vertices take the colour of the nearest coloured vertices along the mesh.
     """
-    vertices, frame = proxy.mesh.vertices, views.frame
+    vertices = proxy.mesh.vertices
+    frame = views.frame
     bias_m = BIAS * float(proxy.bounds.size_m.norm())
     total = vertices.new_zeros(len(vertices), 4)
     for view in range(len(frame.cameras)):
+        # sample the camera at the vertices
         camera = frame.cameras[view]
         uv, z = project(vertices, camera)
         rgb = frame.rgb[view].to(vertices) / 255
@@ -85,6 +89,8 @@ def vertex_colours(proxy: GeometryProxy, views: ContextViews) -> Float[Tensor, "
         sample = sample_bilinear(torch.cat([rgb * mask, mask[None]])[None], uv)[0]
         column, row = uv[0].long().unbind(-1)
         surface = depth[row.clamp(0, depth.shape[0] - 1), column.clamp(0, depth.shape[1] - 1)]
+
+        # add the colours of the visible ones, by their angle to the camera
         visible = in_view(uv, z, camera)[0] & (surface > 0) & (z[0] <= surface + bias_m) & (sample[:, 3] > MIN_MASK)
         to_camera = F.normalize(camera.centers - vertices, dim=-1)
         weight = visible * (proxy.normals * to_camera).sum(-1).clamp(min=0) ** FRONTAL_POWER
@@ -104,7 +110,8 @@ def _draw(
 ) -> None:
     """Draw squares of these sides around these pixels, in order; sides must not decrease."""
     for side in np.unique(sides):
-        own, reach = sides == side, np.arange(side) - side // 2
+        own = sides == side
+        reach = np.arange(side) - side // 2
         y, x = np.broadcast_arrays(rows[own, None, None] + reach[:, None], columns[own, None, None] + reach)
         inside = (y >= 0) & (y < image.shape[0]) & (x >= 0) & (x < image.shape[1])
         image[y[inside], x[inside]] = colours[own][np.nonzero(inside)[0]]

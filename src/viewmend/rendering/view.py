@@ -19,7 +19,7 @@ from viewmend.rendering.error_mask import MIN_WEIGHT, Evidence, error_rule, hole
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 SELECTIONS = ("angle", "direction")
-"""Rules by which cameras are closest to a view."""
+"""The rules by which cameras may be closest to a view (`RenderConfig.selection`)."""
 SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 """The proxy's depth in the frame's cameras of these names."""
 
@@ -83,7 +83,8 @@ def render_view(
     raster = rasterize(proxy.mesh, target)
     normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
-    surface = _Surface(raster.depth[0], normals, center, float(proxy.bounds.size_m.norm()))
+    size_m = float(proxy.bounds.size_m.norm())
+    surface = _Surface(raster.depth[0], normals, center, size_m)
     return _colour(frame, target, surface, config, exclude, source_depth)
 
 
@@ -103,10 +104,14 @@ def render_depth(
     """
     uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device)
     points = unproject(uv_px.flatten(0, 1)[None], depth.flatten()[None], target)[0].view(*depth.shape, 3)
-    across, down = (torch.gradient(points, dim=axis)[0] for axis in (1, 0))
+    across = torch.gradient(points, dim=1)[0]
+    down = torch.gradient(points, dim=0)[0]
     normals = normalize(torch.linalg.cross(down, across), dim=-1)
-    there = points[depth > 0] if bool((depth > 0).any()) else points.new_zeros(1, 3)
-    surface = _Surface(depth, normals, there.mean(0), float((there.amax(0) - there.amin(0)).norm()))
+    visible = points[depth > 0]
+    if not len(visible):
+        visible = points.new_zeros(1, 3)
+    size_m = float((visible.amax(0) - visible.amin(0)).norm())
+    surface = _Surface(depth, normals, visible.mean(0), size_m)
     return _colour(frame, target, surface, config, (), source_depth)
 
 
@@ -136,20 +141,35 @@ def _colour(
         raise ValueError(
             f"expected a camera to colour the view, got {count} cameras with all of them excluded; exclude fewer"
         )
-    usable, (depth, normals, center, size_m) = frame.cameras.select(names), surface
-    mask = (depth > 0).to(depth)
-    candidate_views = select_closest(target, usable, center, len(usable), config.selection)
+    usable = frame.select(names)  # the same frame, if no camera is excluded
+
+    # blend the closest cameras on the surface
+    candidate_views = select_closest(target, usable.cameras, surface.center, len(names), config.selection)
     source_views = candidate_views[: config.cameras]
     sources = ContextViews(frame.select(source_views), source_depth(source_views))
-    blended = blend(target, depth, normals, sources, config.blend.depth_bias * size_m, config.blend)
+    bias_m = config.blend.depth_bias * surface.size_m
+    blended = blend(target, surface.depth, surface.normals, sources, bias_m, config.blend)
 
-    evidence = Evidence(mask, depth, blended)
-    coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)
-    weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
-    used = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
-    silhouettes = None if used.mask is None else Silhouettes(used.mask, used.cameras)
-    rgb, error, more = blended.rgb * coloured, holes(evidence), (frame.time, candidate_views, silhouettes)
-    return IncompleteView(target, rgb, mask, error, depth, source_views, weights, *more), evidence
+    # find the pixels of the surface that have a colour
+    mask = (surface.depth > 0).to(surface.depth)
+    total = blended.weights.sum(0)
+    coloured = mask * (total >= MIN_WEIGHT)
+    evidence = Evidence(mask, surface.depth, blended)
+
+    silhouettes = None if usable.mask is None else Silhouettes(usable.mask, usable.cameras)
+    view = IncompleteView(
+        camera=target,
+        rgb=blended.rgb * coloured,
+        mask=mask,
+        error=holes(evidence),
+        depth=surface.depth,
+        source_views=source_views,
+        weights=blended.weights / total.clamp(min=torch.finfo(total.dtype).tiny) * coloured,
+        time=frame.time,
+        candidate_views=candidate_views,
+        silhouettes=silhouettes,
+    )
+    return view, evidence
 
 
 def select_closest(
@@ -163,10 +183,12 @@ def select_closest(
     k names if there are fewer cameras.
     """
     if selection == "direction":
-        angle = (-(cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2])).tolist()
+        distance = -(cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2])
     else:
-        angle = angles_to(target, cameras, subject_center).tolist()
-    return tuple(cameras.names[view] for view in sorted(range(len(cameras)), key=lambda view: angle[view])[:k])
+        distance = angles_to(target, cameras, subject_center)
+    distances = distance.tolist()
+    nearest = sorted(range(len(cameras)), key=lambda view: distances[view])
+    return tuple(cameras.names[view] for view in nearest[:k])
 
 
 def angles_to(target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"]) -> Float[Tensor, "view"]:

@@ -55,6 +55,7 @@ class PatchTransformer(Network):
         super().__init__()
         self.config = config
         self.background = config.background
+        self.window_frames = max(config.n_c, config.k_w * config.n_w)
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
@@ -86,7 +87,7 @@ class PatchTransformer(Network):
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
         times = window_times(view.time, self.config)[: context.quality.context_times]
-        frames = context.encoded(times, self.source_names(view), self.encode_contexts)
+        frames = self._encoded(times, self.source_names(view), context)
         prediction = self([view], [frames], context.quality.top_k)[0]
         return CompletedView(view, prediction.completed.clamp(0, 1), prediction.alpha), state
 
@@ -94,12 +95,16 @@ class PatchTransformer(Network):
     def encode_history(self, view: IncompleteView, context: ContextProvider) -> None:
         """Encode the view's cameras at the earlier frames of its window."""
         if bool((view.error > 0).any()):
-            context.encoded(window_times(view.time, self.config)[1:], self.source_names(view), self.encode_contexts)
+            self._encoded(window_times(view.time, self.config)[1:], self.source_names(view), context)
 
     @torch.no_grad()
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
         """Encode all of these cameras at their frame."""
-        context.encoded((views.frame.time,), views.frame.cameras.names, self.encode_contexts)
+        self._encoded((views.frame.time,), views.frame.cameras.names, context)
+
+    def _encoded(self, times: Sequence[int], names: Sequence[str], context: ContextProvider) -> list[ContextFrame]:
+        """These cameras in these frames, encoded now or for an earlier view."""
+        return context.encoded(times, names, self.encode_contexts, self.encoding_kind)
 
     def source_names(self, view: IncompleteView) -> tuple[str, ...]:
         """Names of the cameras in a view's context, the closest first (section 2)."""
