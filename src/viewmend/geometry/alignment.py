@@ -17,16 +17,15 @@ from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
 
 STEP_PX = 1.0
-"""Shifts of this size are tried along each image axis."""
+"""Shifts of this many pixels are tried along each image axis."""
 LARGEST_PX = 1.5
-"""Largest shift that is accepted."""
+"""A larger shift than this, in pixels, is not accepted."""
 MARGIN = 0.05
-"""How much larger than the first hull the box is in which the others are carved, to each side."""
+"""The box in which shifted hulls are carved is larger than the first hull by this fraction, to each side."""
 WORTH_MOVING = 0.003
-"""A shift counts if hull and masks then agree better by this much (IoU): above the noise of exact calibrations."""
-
+"""A shift counts if the IoU of hull and masks rises by this much, which is above the noise of exact calibrations."""
 LEAST_IOU = 0.8
-"""Below this IoU a mask or a camera is wrong, and no shift is applied."""
+"""No shift is applied if the IoU stays below this, because a mask or a camera is wrong then."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,8 @@ def _peak(value: Callable[[float], float], middle: float) -> tuple[float, float]
 
     The agreement of outlines falls linearly to both sides of its peak: two lines of equal slope are fitted.
     """
-    low, high = value(-STEP_PX), value(STEP_PX)
+    low = value(-STEP_PX)
+    high = value(STEP_PX)
     fall = middle - min(low, high)
     if fall <= 0:
         return 0.0, middle

@@ -52,13 +52,30 @@ class Cameras(OnDevice):
         twice = sorted({name for name in self.names if self.names.count(name) > 1})
         if twice:
             raise ValueError(f"expected a different name for each camera, got several cameras {twice}; rename them")
-        matrix, text = (torch.float32,), "convert it with .float()"
-        arrange = "give one 3 x 3 matrix per camera"
-        check_tensor("K", self.K, matrix, (count, 3, 3), convert=text, arrange=arrange)
-        pose, arrange = self.camera_from_world, "give one pose per camera, with the last row 0 0 0 1"
-        check_tensor("camera_from_world", pose, matrix, (count, 4, 4), convert=text, arrange=arrange)
-        size, arrange = (torch.int64, torch.int32), "give width and height of each camera"
-        check_tensor("size_px", self.size_px, size, (count, 2), convert="convert it with .long()", arrange=arrange)
+        check_tensor(
+            "K",
+            self.K,
+            (torch.float32,),
+            (count, 3, 3),
+            convert="convert it with .float()",
+            arrange="give one 3 x 3 matrix per camera",
+        )
+        check_tensor(
+            "camera_from_world",
+            self.camera_from_world,
+            (torch.float32,),
+            (count, 4, 4),
+            convert="convert it with .float()",
+            arrange="give one pose per camera, with the last row 0 0 0 1",
+        )
+        check_tensor(
+            "size_px",
+            self.size_px,
+            (torch.int64, torch.int32),
+            (count, 2),
+            convert="convert it with .long()",
+            arrange="give width and height of each camera",
+        )
 
     def check_single(self) -> None:
         """ValueError unless this is one camera that passes `check`."""

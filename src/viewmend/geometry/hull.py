@@ -16,13 +16,13 @@ from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.geometry.threads import parallel_for
 
 FOREGROUND = 127
-"""Threshold for binary foreground."""
-
+"""A mask's pixel is foreground if its value, from 0 to 255, is above this."""
 TILES = 32
-"""Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
-
+"""The search for the subject's box divides a mask's shorter side into this many tiles."""
 BLOCK = 4
-"""Side in voxels of the blocks, and in (pooled) pixels of the mask tiles, that the fast path judges whole."""
+"""The kernels judge blocks of this many voxels, and tiles of this many pooled pixels, whole."""
+NEAR_M = 1e-6
+"""A camera does not see what is nearer than this, in metres."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,8 @@ def visual_hull(
         ValueError: there is one camera only.
     """
     check_views(cameras)
-    voxels, needed = Cubes.of(bounds, config.resolution), needed_views(len(cameras), config)
+    voxels = Cubes.of(bounds, config.resolution)
+    needed = needed_views(len(cameras), config)
     pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
     if _has_kernels(mask):
         values = _carve_cpu(mask, pool, cameras, voxels, needed)
@@ -109,7 +110,8 @@ def occupied_bounds(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> Bounds | None:
     """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
-    needed, tile = needed_views(len(cameras), config), max(1, min(mask.shape[1:]) // TILES)
+    needed = needed_views(len(cameras), config)
+    tile = max(1, min(mask.shape[1:]) // TILES)
     if _has_kernels(mask):
         find = partial(_occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras)
     else:
@@ -155,11 +157,15 @@ def _carve_cpu(
 
     views, height, width = mask.shape
     rows, columns = -(-height // pool), -(-width // pool)
-    masks, soft, values = mask.numpy(), np.empty((views, rows + 1, columns + 1), np.uint8), torch.empty(voxels.shape)
     P, lens, size, low = _kernel_arrays(cameras, voxels)
+    masks = mask.numpy()
+    soft = np.empty((views, rows + 1, columns + 1), np.uint8)
     parallel_for(lambda view: kernels.soften(masks[view], *size[view, ::-1], pool, soft[view]), views)
-    sums, side_m, out = _count_tiles(soft, rows, columns, BLOCK), voxels.side_m, values.numpy()
-    given = P, lens, size, soft, pool, BLOCK, sums, low, side_m, needed, BLOCK
+    sums = _count_tiles(soft, rows, columns, BLOCK)
+
+    values = torch.empty(voxels.shape)
+    out = values.numpy()
+    given = (P, lens, size, soft, pool, BLOCK, sums, low, voxels.side_m, needed, BLOCK)
     parallel_for(lambda slab: kernels.carve_blocks(*given, slab * BLOCK, out), -(-voxels.shape[0] // BLOCK))
     return values
 
@@ -178,9 +184,10 @@ def _occupied_cpu(
 ) -> Bool[Tensor, "x y z"]:
     from viewmend.geometry._hull_numba import occupied_blocks
 
-    occupied = torch.empty(blocks.shape, dtype=torch.bool)
     P, lens, size, low = _kernel_arrays(cameras, blocks)
-    given, out = (P, lens, size, tile, sums, low, blocks.side_m, needed), occupied.numpy()
+    occupied = torch.empty(blocks.shape, dtype=torch.bool)
+    out = occupied.numpy()
+    given = (P, lens, size, tile, sums, low, blocks.side_m, needed)
     parallel_for(lambda slab: occupied_blocks(*given, slab, out), blocks.shape[0])
     return occupied
 
@@ -229,7 +236,8 @@ def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras
 
 
 def _mask_box(mask: UInt8[Tensor, "height width"]) -> Float[Tensor, "4"]:
-    columns, rows = mask.any(0).nonzero()[:, 0], mask.any(1).nonzero()[:, 0]
+    columns = mask.any(0).nonzero()[:, 0]
+    rows = mask.any(1).nonzero()[:, 0]
     return torch.stack([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]).float()
 
 
@@ -251,9 +259,6 @@ def _cube_around(
     reach = (half_at_1 * distance)[distance > 0]
     half = reach.amax() if largest else reach.median()
     return Bounds(middle - half, middle + half)
-
-
-NEAR_M = 1e-6
 
 
 def soften(

@@ -13,17 +13,18 @@ from viewmend.geometry.hull import OccupancyGrid
 from viewmend.geometry.sampling import in_view
 
 BLOCK = 2
-"""Side in voxels of the blocks that are labelled: parts less than a block apart count as one."""
+"""The blocks that are labelled have this many voxels along each side; parts less than a block apart count as one."""
 CELL = 1.25
-"""Side of the cells in which images are compared, relative to the nearest voxel's image: no cell inside is missed."""
+"""Images are compared in square cells, whose side is this many times the nearest voxel's image, so that no cell inside
+a part is missed."""
 COVERED = 0.75
-"""A part is not needed if the others cover this share of its image in every camera. Masks of real cameras disagree by
-strips at the outline, which a part can cover by chance."""
+"""A part is not needed if the others cover this fraction of its image in every camera. Masks of real cameras disagree
+by strips at the outline, which a part can cover by chance."""
 SPECK = 4
-"""Nor is a part needed that covers no more than this many cells of any image on its own: a speck next to a hand. The
-largest part stays unless the others cover it."""
+"""A part is not needed either if it covers at most this many cells of each image on its own, such as a speck next to a
+hand. The largest part stays unless the others cover it."""
 MANY = 2000
-"""From this count on, distinct numbers are found by marking them instead of by sorting."""
+"""Distinct numbers are found by marking them if there are at least this many, else by sorting."""
 
 
 def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGrid:
@@ -70,9 +71,12 @@ def _grown(blocks: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
 
 def _surface(inside: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
     """The voxels with a face that is outside: all that can be seen."""
-    around, (x, y, z) = pad(inside, [1] * 6), (slice(1, -1),) * 3
-    core = around[:-2, y, z] & around[2:, y, z] & around[x, :-2, z] & around[x, 2:, z]
-    return inside & ~(core & around[x, y, :-2] & around[x, y, 2:])
+    around = pad(inside, [1] * 6)
+    own = slice(1, -1)
+    core_x = around[:-2, own, own] & around[2:, own, own]
+    core_y = around[own, :-2, own] & around[own, 2:, own]
+    core_z = around[own, own, :-2] & around[own, own, 2:]
+    return inside & ~(core_x & core_y & core_z)
 
 
 def _to_voxels(blocks: Bool[Tensor, "x_block y_block z_block"]) -> Bool[Tensor, "x y z"]:
@@ -121,7 +125,9 @@ class _Cells:
     @classmethod
     def of(cls, part: Int[np.ndarray, "point"], y: Int[np.ndarray, "point"], x: Int[np.ndarray, "point"]) -> "_Cells":
         width = int(x.max()) + 2
-        place, count = y * width + x, np.zeros((int(y.max()) + 2) * width, np.int64)
+        height = int(y.max()) + 2
+        place = y * width + x
+        count = np.zeros(height * width, np.int64)
         around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
         order = part.argsort(kind="stable")
         numbers, first = np.unique(part[order], return_index=True)

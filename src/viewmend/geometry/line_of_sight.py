@@ -11,15 +11,19 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 
 POINTS = 120
-"""Points of each outline."""
+"""An outline has about this many points."""
 PLACES = 96
-"""Places that are tried along each line of sight at first."""
+"""A search begins with this many places along each line of sight."""
 HALVINGS = 4
-"""Number of times that the step around the best position is halved; twice more after a search."""
+"""The step around the best place is halved this many times; twice more after a search."""
 NEAR_M = 1e-3
-"""What is nearer to a camera, or behind it, is not seen."""
+"""A camera does not see what is nearer than this, in metres."""
 OUTLIER_PX = 1.0
-"""What is missed by more than this counts less: masks are wrong in places."""
+"""Residuals of more than this many pixels count less, because masks are wrong in places."""
+FINER = 3
+"""Masks are enlarged by this factor, so that soft ones tell parts of a pixel."""
+BORDER_PX = 3
+"""An outline within this many pixels of its image's border is where the image ends, not the subject."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class LineSamples:
 
     @property
     def residuals(self) -> Float64[np.ndarray, "point place"]:
-        """What the place is outside of all masks, squared pixels, of which large ones count less."""
+        """How far the place is outside of all masks, squared pixels; large distances count less."""
         return 2 * OUTLIER_PX**2 * (np.sqrt(1 + (self.outside_px / OUTLIER_PX) ** 2) - 1).sum(-1)
 
     def gradient(self, rig: Rig) -> Float64[np.ndarray, "point place view 3"]:
@@ -131,7 +135,7 @@ class LinesOfSight:
         return self.refine_depths(rig, best, halvings=2 + HALVINGS)
 
     def least_residuals(self, rig: Rig) -> Float64[np.ndarray, "point"]:
-        """What the best place of each line of sight is outside of all masks, as `LineSamples.residuals`."""
+        """The residual of the best place of each line of sight, as `LineSamples.residuals`."""
         return self.sample(rig, self.search_depths(rig)[:, None]).residuals[:, 0]
 
     def refine_depths(
@@ -144,12 +148,6 @@ class LinesOfSight:
             depth = tried[np.arange(len(depth)), self.sample(rig, tried).residuals.argmin(1)]
             step /= 2
         return depth
-
-
-FINER = 3
-"""Masks are enlarged by this much, so that soft ones tell parts of a pixel."""
-BORDER_PX = 3
-"""An outline so near to its image's border is where the image ends, not the subject."""
 
 
 def _find_outline(
@@ -166,7 +164,8 @@ def _find_outline(
     inside = (large > FOREGROUND).astype(np.uint8)
     if not inside.any() or inside.all():
         return None
-    away, within = (cv2.distanceTransform(side, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for side in (1 - inside, inside))
+    away = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    within = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside_px = cv2.resize((away - within) / FINER, (width, height), interpolation=cv2.INTER_AREA)
     contours = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     along = np.concatenate([contour[:, 0] for contour in contours]).astype(np.float64)
@@ -188,11 +187,21 @@ def _interpolate(
     `flat` has the pixels of all images; the image of a position begins at `first`, and `size` is its width and height.
     """
     width, height = size
-    x, y = np.clip(uv_px[..., 0] - 0.5, 0, width - 1.001), np.clip(uv_px[..., 1] - 0.5, 0, height - 1.001)
-    left, top = x.astype(int), y.astype(int)
-    right, below = x - left, y - top
+    x = np.clip(uv_px[..., 0] - 0.5, 0, width - 1.001)
+    y = np.clip(uv_px[..., 1] - 0.5, 0, height - 1.001)
+    left = x.astype(int)
+    top = y.astype(int)
+    right = x - left
+    below = y - top
+
+    # the four pixels around, row by row
     at = first + top * width + left
-    a, b, c, d = flat[at], flat[at + 1], flat[at + width], flat[at + width + 1]
-    upper, lower = a + right * (b - a), c + right * (d - c)
+    a = flat[at]
+    b = flat[at + 1]
+    c = flat[at + width]
+    d = flat[at + width + 1]
+
+    upper = a + right * (b - a)
+    lower = c + right * (d - c)
     slope_x = (b - a) + below * ((d - c) - (b - a))
     return upper + below * (lower - upper), np.stack([slope_x, lower - upper], -1)

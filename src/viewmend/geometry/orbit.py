@@ -15,7 +15,16 @@ from viewmend.geometry.proxy import reconstruct
 from viewmend.geometry.rigid import look_at
 
 AGREED = 0.5
-"""Length of the mean of the images' up directions below which they do not agree."""
+"""The images' up directions do not agree if the length of their mean is below this."""
+MARGIN = 0.06
+"""A fitted path leaves this fraction of half an image free around the subject."""
+FITTED_FRAMES = 24
+"""At most this many frames of a motion are reconstructed to find what the motion covers."""
+FITTED_RESOLUTION = 64
+"""Their hulls have this many voxels along the longest side."""
+FULL_TURN_GAP_RAD = math.radians(130)
+"""A rig with a larger gap between neighbouring cameras does not surround the subject, so its orbit swings back and
+forth."""
 
 
 def upright(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -36,14 +45,6 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
     ahead = up.new_tensor([0.0, 0.0, 1.0] if abs(float(up[2])) < 0.9 else [1.0, 0.0, 0.0])
     front = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
     return front, torch.linalg.cross(up, front)
-
-
-MARGIN = 0.06
-"""Part of half an image that stays free around what it is fitted to."""
-FITTED_FRAMES, FITTED_RESOLUTION = 24, 64
-"""Frames of a motion, and voxels along the longest side of their hulls, to find what the motion covers."""
-FULL_TURN_GAP_RAD = math.radians(130)
-"""A rig with a larger gap does not surround the subject: its orbit swings back and forth."""
 
 
 def orbit(
@@ -113,10 +114,17 @@ def orbit_around(
     elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
     front, side = horizontal_axes(up)
     azimuths = _swing(torch.atan2(offsets @ side, offsets @ front).tolist(), views, frames_per_turn, arc_rad)
-    (width, height), radius_m = cameras.size_px[0].tolist(), float(distance.mean())
-    visible_m, size_px = min(width, height) / float(cameras.K[0, 1, 1]) * radius_m, size_px or (width, height)
-    where = {"radius_m": radius_m, "elevation_rad": float(elevation), "visible_m": visible_m}
-    return orbit(azimuths, size_px, **where, center=center.cpu(), up=up.cpu())
+    width, height = cameras.size_px[0].tolist()
+    radius_m = float(distance.mean())
+    return orbit(
+        azimuths,
+        size_px or (width, height),
+        radius_m=radius_m,
+        elevation_rad=float(elevation),
+        center=center.cpu(),
+        up=up.cpu(),
+        visible_m=min(width, height) / float(cameras.K[0, 1, 1]) * radius_m,
+    )
 
 
 def coarse_surface(
@@ -133,13 +141,14 @@ def thinned(moments: Sequence[int]) -> list[int]:
 
 def fit_to(path: Cameras, points: Float[Tensor, "point 3"]) -> Cameras:
     """The cameras of a path, of one image size, with the focal length at which all images show all points."""
-    path, points = path.to("cpu"), points.cpu()
-    uv_px, z = project(points, path)
-    half = path.size_px[:, None].float() / 2
+    cameras = path.to("cpu")
+    uv_px, z = project(points.cpu(), cameras)
+    half = cameras.size_px[:, None].float() / 2
     ratio = (((uv_px - half) / half).abs().amax(-1) * (z > 0)).max()
-    K = path.K.clone()
-    K[:, 0, 0], K[:, 1, 1] = (K[:, axis, axis] * (1 - MARGIN) / ratio for axis in (0, 1))
-    return replace(path, K=K)
+    K = cameras.K.clone()
+    for axis in (0, 1):
+        K[:, axis, axis] = K[:, axis, axis] * (1 - MARGIN) / ratio
+    return replace(cameras, K=K)
 
 
 def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int, arc_rad: float | None = None) -> list[float]:

@@ -27,7 +27,7 @@ WORTH_RECARVING = 0.85
 """A subject smaller than this fraction of the carved box is carved again in its own box."""
 
 RECARVINGS = 3
-"""Maximum number of repeated carvings."""
+"""A subject is carved again at most this many times."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ def reconstruct(
         tight = _filled_bounds(grid, box)
         if tight is None or float(tight.size_m.max()) > WORTH_RECARVING * float(box.size_m.max()):
             break
-        box, grid = tight, without_floating_parts(visual_hull(mask, cameras, tight, config), cameras)
+        box = tight
+        grid = without_floating_parts(visual_hull(mask, cameras, tight, config), cameras)
     mesh = extract_surface(grid)
     return GeometryProxy(mesh, vertex_normals(mesh), box)
 
@@ -89,5 +90,6 @@ def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
     if filled is None:
         return None
     first, end = torch.tensor([(side.start, side.stop) for side in filled], device=grid.low.device).T
-    low, high = grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m
+    low = grid.low + (first - 1) * grid.voxel_m
+    high = grid.low + (end + 1) * grid.voxel_m
     return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))

@@ -12,10 +12,13 @@ from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.threads import light_operations, parallel_for
 
 NEAR_M = 1e-6
-"""Surface nearer than this is not drawn."""
+"""A surface nearer than this, in metres, is not drawn."""
 
 BANDS = 4
-"""Horizontal strips that share one view among threads when there are few views."""
+"""A view is divided into this many horizontal strips for the threads, if there are fewer views than this."""
+
+CANDIDATES = 1 << 22
+"""The rasteriser in torch tests at most this many pixels at once, which bounds its memory."""
 
 
 @dataclass(frozen=True)
@@ -46,24 +49,30 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
     from viewmend.geometry import _rasterize_numba as kernels
 
     width, height = cameras.max_size_px
-    views, vertices, faces = len(cameras), mesh.vertices.detach().numpy(), mesh.faces.numpy()
+    views = len(cameras)
+    vertices = mesh.vertices.detach().numpy()
+    faces = mesh.faces.numpy()
     P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).detach().numpy()
     size = cameras.size_px.tolist()
     projected = torch.empty(views, len(vertices), 5, dtype=torch.float64).numpy()
-    depth = torch.zeros(views, height, width)
-    triangle = torch.full((views, height, width), -1, dtype=torch.int32)
-    depths, triangles = depth.numpy(), triangle.numpy()
+    raster = Raster(
+        depth=torch.zeros(views, height, width),
+        triangle=torch.full((views, height, width), -1, dtype=torch.int32),
+    )
+    depths = raster.depth.numpy()
+    triangles = raster.triangle.numpy()
     bands = 1 if views >= BANDS else BANDS
 
     def draw(item: int) -> None:
         view, band = divmod(item, bands)
         columns, rows = size[view]
-        first, end = rows * band // bands, rows * (band + 1) // bands
+        first = rows * band // bands
+        end = rows * (band + 1) // bands
         kernels.draw_band(projected[view], faces, NEAR_M, side, first, end, columns, depths[view], triangles[view])
 
     parallel_for(lambda view: kernels.project_vertices(vertices, P[view], projected[view]), views)
     parallel_for(draw, views * bands)
-    return Raster(depth, triangle)
+    return raster
 
 
 def interpolate(
@@ -86,20 +95,19 @@ def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, i
     from viewmend.geometry._rasterize_numba import interpolate_band
 
     P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
-    given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()
-    triangles, images, rows = raster.triangle.numpy(), image.numpy(), image.shape[1]
+    given = (attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy())
+    triangles = raster.triangle.numpy()
+    images = image.numpy()
+    rows = image.shape[1]
 
     def work(item: int) -> None:
         view, part = divmod(item, BANDS)
-        first, end = rows * part // BANDS, rows * (part + 1) // BANDS
+        first = rows * part // BANDS
+        end = rows * (part + 1) // BANDS
         interpolate_band(*given, P[view], triangles[view], first, end, images[view])
 
     parallel_for(work, len(cameras) * BANDS)
     return image
-
-
-CANDIDATES = 1 << 22
-"""Pixels tested at once; bounds the memory."""
 
 
 def homogeneous(vertices: Float[Tensor, "vertex 3"], cameras: Cameras) -> Float[Tensor, "view vertex 3"]:

@@ -11,6 +11,12 @@ from viewmend.geometry.hull import OccupancyGrid
 from viewmend.geometry.mesh import Mesh
 
 ISO = 0.5
+"""The surface is where the occupancy has this value."""
+EDGES = tuple((k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1)
+"""The twelve edges of a cell are pairs of corners: four along x, four along y, four along z."""
+
+Loop = list[int]
+"""Edges of a cell in the order in which the surface crosses them."""
 
 
 def extract_surface(grid: OccupancyGrid) -> Mesh:
@@ -49,14 +55,16 @@ def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3
 def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """The same on any device."""
     inside = values > ISO
-    parts, vertex_of_edge = [], torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
+    vertex_of_edge = torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
+    parts = []
     count = 0
     for axis in range(3):
         steps = values.shape[axis] - 1
         changes = inside.narrow(axis, 0, steps) != inside.narrow(axis, 1, steps)
         x, y, z = changes.nonzero(as_tuple=True)
         position = torch.stack([x, y, z], -1).to(values)
-        near, far = values[x, y, z], values.narrow(axis, 1, steps)[x, y, z]
+        near = values[x, y, z]
+        far = values.narrow(axis, 1, steps)[x, y, z]
         position[:, axis] += (ISO - near) / (far - near)
         vertex_of_edge[axis, x, y, z] = torch.arange(count, count + len(x), dtype=torch.int32, device=x.device)
         parts.append(position)
@@ -96,13 +104,6 @@ def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "axis=3 x y z"]) -> I
     return vertex_of_edge.flatten()[flat[:, None] + start[edges[owner, slot]]]
 
 
-EDGES = tuple((k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1)
-"""The twelve edges as pairs of corners: four along x, four along y, four along z."""
-
-Loop = list[int]
-"""Edges of a cell in the order in which the surface crosses them."""
-
-
 @cache
 def triangle_table() -> Int[Tensor, "256 5 3"]:
     """For each case up to five triangles, as edges whose crossings are their corners; -1 where there are fewer.
@@ -123,14 +124,15 @@ def _cell_faces() -> tuple[tuple[int, ...], ...]:
     """The six faces as corners, counter-clockwise seen from outside."""
     faces = []
     for axis in range(3):
-        b, c = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        b = 1 << (axis + 1) % 3
+        c = 1 << (axis + 2) % 3
         faces += [(0, c, b | c, b), tuple(k | 1 << axis for k in (0, b, b | c, c))]
     return tuple(faces)
 
 
 def _edge(face: tuple[int, ...], side: int) -> int:
-    a, b = face[side], face[(side + 1) % 4]
-    return EDGES.index((min(a, b), max(a, b)))
+    corners = (face[side], face[(side + 1) % 4])
+    return EDGES.index((min(corners), max(corners)))
 
 
 def _loops(case: int) -> list[Loop]:
@@ -139,15 +141,19 @@ def _loops(case: int) -> list[Loop]:
     for face in _cell_faces():
         inside = [case >> k & 1 for k in face]
         for enter in range(4):
-            if not inside[enter] and inside[leave := (enter + 1) % 4]:
-                while inside[(leave + 1) % 4]:
-                    leave = (leave + 1) % 4
-                following[_edge(face, enter)] = _edge(face, leave)
+            leave = (enter + 1) % 4
+            if inside[enter] or not inside[leave]:
+                continue
+            while inside[(leave + 1) % 4]:
+                leave = (leave + 1) % 4
+            following[_edge(face, enter)] = _edge(face, leave)
     loops = []
     while following:
-        loop = [next(iter(following))]
-        while (edge := following.pop(loop[-1])) != loop[0]:
+        loop = []
+        edge = next(iter(following))
+        while edge in following:
             loop.append(edge)
+            edge = following.pop(edge)
         loops.append(loop)
     return loops
 

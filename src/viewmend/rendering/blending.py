@@ -72,8 +72,19 @@ def blend(
         bias_m: tolerance of the depth test, metres.
         config: exponents and tolerances.
     """
-    if depth.device.type != "cpu":
-        return blend_torch(camera, depth, normals, sources, bias_m, config)
+    blend_on = _blend_cpu if depth.device.type == "cpu" else blend_torch
+    return blend_on(camera, depth, normals, sources, bias_m, config)
+
+
+def _blend_cpu(
+    camera: Cameras,
+    depth: Float[Tensor, "height width"],
+    normals: Float[Tensor, "height width 3"],
+    sources: ContextViews,
+    bias_m: float,
+    config: BlendConfig,
+) -> Blend:
+    """`blend` by the kernel in numba."""
     from viewmend.rendering._blend_numba import blend_rows
 
     frame = sources.frame
@@ -121,24 +132,33 @@ def blend_torch(
     config: BlendConfig,
 ) -> Blend:
     """`blend` in torch, for any device."""
+    # the surface's points in the novel view
     row, column = (depth > 0).nonzero(as_tuple=True)
     pixels = torch.stack([column, row], -1) + 0.5
     points = unproject(pixels[None].to(depth), depth[row, column][None], camera)[0]
     normal = normalize(normals[row, column], dim=-1)
     to_viewer = normalize(camera.centers[0] - points, dim=-1)
 
+    # each camera's colour and weight there
     views = range(len(sources.frame.cameras))
     samples = [_sample(points, normal, to_viewer, sources, view, bias_m, config) for view in views]
-    weight, colour = (torch.stack(parts) for parts in zip(*samples, strict=True))
+    weight = torch.stack([own_weight for own_weight, _ in samples])
+    colour = torch.stack([own_colour for _, own_colour in samples])
+
+    # their weighted mean and variance
     total = weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
     mean = (weight[:, None] * colour).sum(0) / total
     variance = (weight * (colour - mean).square().mean(1)).sum(0) / total
-    rgb, raw = depth.new_zeros(3, *depth.shape), depth.new_zeros(len(views), *depth.shape)
-    disagreement = torch.zeros_like(depth)
-    rgb[:, row, column] = mean
-    raw[:, row, column] = weight
-    disagreement[row, column] = variance.sqrt()
-    return Blend(rgb, raw, disagreement)
+
+    blended = Blend(
+        rgb=depth.new_zeros(3, *depth.shape),
+        weights=depth.new_zeros(len(views), *depth.shape),
+        disagreement=torch.zeros_like(depth),
+    )
+    blended.rgb[:, row, column] = mean
+    blended.weights[:, row, column] = weight
+    blended.disagreement[row, column] = variance.sqrt()
+    return blended
 
 
 def _sample(
