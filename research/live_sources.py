@@ -26,7 +26,7 @@ import cv2
 from live_senders import FPS, FRAMES, SIZE_PX, make, number_of
 from measure import summarise, write
 
-from viewmend.contrib.live_rig.frames import RigSource
+from viewmend.contrib.live_rig.rig_source import RigFileSource
 from viewmend.data.images import read_rgb
 from viewmend.utils.heap import configure_allocator, resident_bytes
 
@@ -98,7 +98,7 @@ def rig_file(folder: Path, videos: Path, kinds: tuple[str, ...] | None, fps: flo
 class Watch:
     """Records the image numbers of every synchronised frame."""
 
-    def __init__(self, frames: RigSource, senders: Senders, videos: Path) -> None:
+    def __init__(self, frames: RigFileSource, senders: Senders, videos: Path) -> None:
         self._frames, self._senders = frames, senders
         self._plates = {name: read_rgb(videos / f"plates/{name}.png", name) for name in senders.names}
         self._next = 0
@@ -151,7 +151,7 @@ def run(options: argparse.Namespace, fps: float, videos: Path, folder: Path) -> 
     senders = Senders(videos, KINDS)
     if options.files:
         senders.phases_s = dict.fromkeys(senders.names, 0.0)
-    frames = RigSource(rig_file(folder, videos, kinds, fps, options.scale), memory_mb=MEMORY_MB)
+    frames = RigFileSource(rig_file(folder, videos, kinds, fps, options.scale), memory_mb=MEMORY_MB)
     watch = Watch(frames, senders, videos)
     if kinds is not None:
         for name in senders.names:
@@ -224,7 +224,7 @@ def results(watch: Watch, memory_mb: list[float], returns: list[dict], counts: d
     }
 
 
-def picture(frames: RigSource, path: Path) -> None:
+def picture(frames: RigFileSource, path: Path) -> None:
     """Draw the newest frame with mask outlines."""
     frame = frames.read(frames.span.newest)
     assert frame is not None and frame.mask is not None

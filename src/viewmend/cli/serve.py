@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from viewmend.stream import StreamConfig
 
 TOKEN_VARIABLE = "VIEWMEND_TOKEN"
-RIG_SOURCE = "viewmend.contrib.live_rig.frames:RigSource"
+RIG_SOURCE = "viewmend.contrib.live_rig.rig_source:RigFileSource"
 RAY_SETTINGS, SERVE_ON_RAY = "viewmend.contrib.ray.replicas:ManyViewers", "viewmend.contrib.ray.replicas:serving"
 """Optional parts, as MODULE:NAME; those of the server itself are in `live.server.EXTENSIONS`."""
 

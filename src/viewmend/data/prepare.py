@@ -65,20 +65,27 @@ class PreparedCapture(CaptureWrapper):
         return limit_camera_size(self.source.cameras.moved(x_px, y_px), self.max_image_size)
 
     def read(self, time: int) -> MultiViewFrame:
-        """Read the frame at index `time` with the calibration of `cameras`.
+        """Read the frame at index `time` with the calibration of `cameras`; see `adjust`.
+
+        CaptureError if the source cannot be read, half of the masks are inverted, or no camera is left.
+        """
+        return self.adjust(self.source.read(time), f"frame '{self.frame_ids[time]}'")
+
+    def adjust(self, frame: MultiViewFrame, label: str) -> MultiViewFrame:
+        """A frame of the source, or of the same rig, with the calibration of `cameras`; `label` is for messages.
 
         A camera whose mask is inverted or wrongly empty, or whose image is black, is left out of the frame and reported
-        once. CaptureError if
-        the source cannot be read, half of the masks are inverted, or no camera is left.
+        once. CaptureError if half of the masks are inverted, or no camera is left.
         """
-        frame = self.source.read(time).without(self.left_out)
+        frame = frame.without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
         text = "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
         issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
         good = [name for name in frame.cameras.names if name in inputs and all(name != i.camera for i in issues)]
         issues += find_blank_images(frame.select(good))
-        where, bad = f"{self.name}: frame '{self.frame_ids[time]}'", [issue.camera for issue in issues if issue.camera]
+        bad = [issue.camera for issue in issues if issue.camera]
+        where = f"{self.name}: {label}"
         _raise_or_warn(where, issues, self._reported)
         if len(bad) == len(frame.cameras):
             raise CaptureError(f"{where}: expected at least one correct mask, got none; redo them")

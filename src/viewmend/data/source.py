@@ -62,6 +62,36 @@ class CaptureSource(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class MemoryCapture:
+    """A capture whose frames are in memory, numbered from 0.
+
+    Examples:
+        >>> from viewmend.data.source import MemoryCapture
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> MemoryCapture("ours", frame.cameras, (frame,)).frame_ids
+        ('0',)
+    """
+
+    name: str
+    cameras: Cameras
+    """All cameras; a frame may lack some of them."""
+    frames: tuple[MultiViewFrame, ...]
+    fps: float | None = None
+    up: Float[Tensor, "3"] | None = None
+    bounds: Bounds | None = None
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """The frames' numbers."""
+        return tuple(str(number) for number in range(len(self.frames)))
+
+    def read(self, time: int) -> MultiViewFrame:
+        """The frame at index `time`."""
+        return self.frames[time]
+
+
 class CaptureWrapper:
     """Base class of sources that change another source; every property is that of the wrapped source."""
 

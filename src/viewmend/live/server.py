@@ -42,7 +42,7 @@ MAX_IMAGES = 4
 TOKEN_EXPECTED = "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN"
 TOO_MANY_IMAGES = f"expected at most {MAX_IMAGES} images at a time; try again"
 EXTENSIONS = {
-    "broadcast": "viewmend.contrib.broadcast:broadcast_extension",
+    "broadcast": "viewmend.contrib.broadcast.extension:broadcast_extension",
 }
 """Optional parts of the server: MODULE:FUNCTION of each, imported on demand. The function is called with the option's
 value, checks it, and returns an `ExtensionFactory`."""

@@ -11,20 +11,22 @@ import torch
 from live.live_servers import PIPELINE, WAIT_S, FakeClock, get, running, wait_until
 from reference.ball import ring
 
-from viewmend.contrib import broadcast as broadcast_module
-from viewmend.contrib.broadcast import (
-    FIRST,
-    INIT,
-    KEPT,
-    LISTED,
-    PLAYLIST,
+from viewmend.contrib.broadcast import extension as broadcast_module
+from viewmend.contrib.broadcast.extension import (
     Broadcast,
     BroadcastSession,
-    FilmSegments,
     add_query,
     broadcast_extension,
     centred_camera,
     choose_fps,
+)
+from viewmend.contrib.broadcast.hls import (
+    INIT,
+    KEPT_SEGMENTS,
+    LISTED_SEGMENTS,
+    MIN_SEGMENTS,
+    PLAYLIST,
+    HlsSegmenter,
 )
 from viewmend.live.client import Client
 from viewmend.live.frame_source import Span
@@ -203,7 +205,7 @@ def test_an_image_that_is_rendered_while_the_video_ends_is_dropped(ball_view):
 
 
 def test_a_failing_encoder_is_started_again(monkeypatch, caplog):
-    add, failures = FilmSegments.add, []
+    add, failures = HlsSegmenter.add, []
 
     def fail_once(self, image, index):
         if index >= 4 and not failures and self._size_px == (64, 48):
@@ -211,7 +213,7 @@ def test_a_failing_encoder_is_started_again(monkeypatch, caplog):
             raise RuntimeError("no more")
         add(self, image, index)
 
-    monkeypatch.setattr(FilmSegments, "add", fail_once)
+    monkeypatch.setattr(HlsSegmenter, "add", fail_once)
     with broadcasting(size=(64, 48)) as server, Client(server.ws) as viewer:
         assert playlist(server).startswith("#EXTM3U")
         assert failures and "while encoding the broadcast" in caplog.text
@@ -233,7 +235,7 @@ def test_a_slow_encoder_leaves_frames_out(monkeypatch):
         if len(frames) == 12:
             made._stopped.set()
 
-    monkeypatch.setattr(FilmSegments, "add", add_slowly)
+    monkeypatch.setattr(HlsSegmenter, "add", add_slowly)
     monkeypatch.setattr(made._stopped, "wait", clock.advance)
     made.session.image = np.zeros((64, 96, 3), np.uint8)
     made._encode(10)
@@ -243,8 +245,8 @@ def test_a_slow_encoder_leaves_frames_out(monkeypatch):
 
 
 def test_a_video_that_does_not_begin_is_an_error(monkeypatch):
-    monkeypatch.setattr(broadcast_module, "FIRST_S", 0.5)
-    monkeypatch.setattr(FilmSegments, "add", lambda self, image, index: None)
+    monkeypatch.setattr(broadcast_module, "START_S", 0.5)
+    monkeypatch.setattr(HlsSegmenter, "add", lambda self, image, index: None)
     with broadcasting(size=(64, 48)) as server:
         status, _, text = fetch(server, "/broadcast/live.m3u8")
         assert status == 503 and b"did not begin in time" in text
@@ -329,7 +331,7 @@ def played(film, names):
 
 
 def test_each_picture_comes_at_its_time_and_each_second_is_a_segment_of_its_own():
-    with FilmSegments((64, 48), FPS) as film:
+    with HlsSegmenter((64, 48), FPS) as film:
         for at in range(22):
             film.add(grey(10 * at), at)
         said, names = listed(film)
@@ -344,7 +346,7 @@ def test_each_picture_comes_at_its_time_and_each_second_is_a_segment_of_its_own(
 
 
 def test_where_pictures_are_left_out_the_others_keep_their_time():
-    with FilmSegments((64, 48), FPS) as film:
+    with HlsSegmenter((64, 48), FPS) as film:
         for at in (0, 1, 4, 7, 8, 12, 16, 21, 22):
             film.add(grey(10 * at), at)
         _, names = listed(film)
@@ -353,26 +355,26 @@ def test_where_pictures_are_left_out_the_others_keep_their_time():
 
 
 def test_a_playlist_is_shown_when_it_is_long_enough_and_never_grows_longer():
-    with FilmSegments((64, 48), FPS) as film:
+    with HlsSegmenter((64, 48), FPS) as film:
         seen, known = 0, []
-        for at in range(FPS * (KEPT + 8)):
+        for at in range(FPS * (KEPT_SEGMENTS + 8)):
             film.add(grey(at % 200), at)
             if film.file(PLAYLIST) is None:
-                assert at <= FPS * FIRST + 1
+                assert at <= FPS * MIN_SEGMENTS + 1
                 continue
             said, names = listed(film)
             seen += 1
-            assert FIRST <= len(names) <= LISTED and all(film.file(name) for name in names)
+            assert MIN_SEGMENTS <= len(names) <= LISTED_SEGMENTS and all(film.file(name) for name in names)
             assert int(said[3].removeprefix("#EXT-X-MEDIA-SEQUENCE:")) == int(names[0].removesuffix(".m4s"))
             known += [name for name in names if name not in known]
-        assert seen and len(known) == KEPT + 7 and known == sorted(known)
-        assert sum(film.file(name) is not None for name in known) == KEPT
+        assert seen and len(known) == KEPT_SEGMENTS + 7 and known == sorted(known)
+        assert sum(film.file(name) is not None for name in known) == KEPT_SEGMENTS
         assert film.file("../secret") is None
 
 
 def test_pictures_of_any_size_fill_the_film():
-    with FilmSegments((64, 48), FPS) as film:
-        for at in range(FPS * FIRST + 2):
+    with HlsSegmenter((64, 48), FPS) as film:
+        for at in range(FPS * MIN_SEGMENTS + 2):
             film.add(np.hstack([grey(30, 40 + at, 91), grey(220, 40 + at, 91)]), at)
         _, pictures = played(film, listed(film)[1])
         assert all(p.shape == (48, 64, 3) for p in pictures)
@@ -381,8 +383,8 @@ def test_pictures_of_any_size_fill_the_film():
 
 def test_noise_does_not_make_segments_of_any_size():
     noise = np.random.default_rng(0)
-    with FilmSegments((640, 360), 30) as film:
-        for at in range(30 * FIRST + 2):
+    with HlsSegmenter((640, 360), 30) as film:
+        for at in range(30 * MIN_SEGMENTS + 2):
             film.add(noise.integers(0, 255, (360, 640, 3), dtype=np.uint8), at)
         sizes = [len(film.file(name)) for name in listed(film)[1]]
         assert max(sizes) < 2_000_000 and max(sizes[1:]) < 1_200_000

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from viewmend.contrib.live_rig.frames import SPARE, Aligner, Taken
+from viewmend.contrib.live_rig.aligner import MAX_COMPLETE, Aligner, TimedImages
 from viewmend.data.native_capture import CameraImages
 
 IMAGES = CameraImages(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.uint8), None)
@@ -17,25 +17,25 @@ def aligner(names="abc", tolerance_s=FRAME_S / 2, wait_s=0.2):
 def put(rig, names, taken_s, now_s=None):
     """A picture of each of these cameras, by default at once."""
     for name in names:
-        rig.put(name, Taken(taken_s, IMAGES), taken_s if now_s is None else now_s)
+        rig.put(name, TimedImages(taken_s, IMAGES), taken_s if now_s is None else now_s)
 
 
-def taken(together):
-    return {name: round(one.taken_s, 6) for name, one in together.taken.items()}
+def times(group):
+    return {name: round(timed.taken_s, 6) for name, timed in group.by_camera.items()}
 
 
-def test_cameras_that_run_apart_come_together():
+def test_cameras_that_run_apart_come_group():
     rig, phase = aligner(), {"a": 0.0, "b": 0.03, "c": -0.02}
     for n in range(20):
         for name, phase_s in phase.items():
             put(rig, name, 5 + n * FRAME_S + phase_s, 5.01 + n * FRAME_S + 0.03)
-        [together] = rig.take(5.05 + n * FRAME_S)
-        assert taken(together) == {name: round(5 + n * FRAME_S + p, 6) for name, p in phase.items()}
-        assert together.spread_s == pytest.approx(0.05)
+        [group] = rig.take(5.05 + n * FRAME_S)
+        assert times(group) == {name: round(5 + n * FRAME_S + p, 6) for name, p in phase.items()}
+        assert group.spread_s == pytest.approx(0.05)
     assert all(counts == {"used": 20} for counts in rig.counts.values())
 
 
-def test_cameras_of_different_delays_come_together():
+def test_cameras_of_different_delays_come_group():
     """One place a camera would never do here: when the slow one's picture comes, the fast one is two further."""
     rig, seen = aligner("ab", wait_s=0.5), []
     events = [
@@ -43,7 +43,7 @@ def test_cameras_of_different_delays_come_together():
     ]
     for now_s, name, taken_s in sorted(events):
         put(rig, name, taken_s, now_s)
-        seen += [taken(together) for together in rig.take(now_s)]
+        seen += [times(group) for group in rig.take(now_s)]
     # While the slow one was not heard yet nobody waits for it: its first pictures are late.
     assert seen[0].keys() == {"a"} and rig.counts["b"]["late"] == 3
     assert seen[3:] == [{"a": round(n * FRAME_S, 6), "b": round(n * FRAME_S, 6)} for n in range(3, 20)]
@@ -55,8 +55,8 @@ def test_a_lost_picture_is_waited_for_only_so_long():
     assert len(rig.take(1.0)) == 1
     put(rig, "ab", 1.1)
     assert rig.take(1.29) == []
-    [together] = rig.take(1.31)
-    assert set(together.taken) == {"a", "b"} and rig.counts["c"]["missing"] == 1
+    [group] = rig.take(1.31)
+    assert set(group.by_camera) == {"a", "b"} and rig.counts["c"]["missing"] == 1
     put(rig, "c", 1.1, 1.32)
     assert rig.take(1.4) == [] and rig.counts["c"]["late"] == 1
 
@@ -67,8 +67,8 @@ def test_whoever_is_past_a_time_does_not_hold_it_up():
     rig.take(1.0)
     put(rig, "a", 1.1)
     put(rig, "b", 1.2)
-    [together] = rig.take(1.2)
-    assert taken(together) == {"a": 1.1}
+    [group] = rig.take(1.2)
+    assert times(group) == {"a": 1.1}
 
 
 def test_cameras_that_are_away_are_not_waited_for():
@@ -93,8 +93,8 @@ def test_pictures_far_from_their_time_are_left_out():
     rig = aligner("ab", tolerance_s=0.01)
     put(rig, "a", 1.0)
     put(rig, "b", 1.02)
-    [together] = rig.take(1.3)
-    assert taken(together) == {"a": 1.0} and rig.counts["b"]["misaligned"] == 1
+    [group] = rig.take(1.3)
+    assert times(group) == {"a": 1.0} and rig.counts["b"]["misaligned"] == 1
 
 
 def test_of_two_pictures_the_nearer_one_is_taken():
@@ -102,8 +102,8 @@ def test_of_two_pictures_the_nearer_one_is_taken():
     put(rig, "a", 1.0, 1.1)
     for taken_s in (1.04, 1.01, 0.97):
         put(rig, "b", taken_s, 1.1)
-    [together] = rig.take(1.1)
-    assert taken(together)["b"] == 1.01 and rig.counts["b"]["surplus"] == 2
+    [group] = rig.take(1.1)
+    assert times(group)["b"] == 1.01 and rig.counts["b"]["surplus"] == 2
 
 
 def test_what_nobody_takes_is_bounded_and_the_newest_wins():
@@ -111,8 +111,8 @@ def test_what_nobody_takes_is_bounded_and_the_newest_wins():
     for n in range(100):
         put(rig, "ab", n * FRAME_S)
     out = rig.take(99 * FRAME_S)
-    assert [round(together.taken["a"].taken_s / FRAME_S) for together in out] == list(range(100 - SPARE - 3, 100))
-    assert rig.counts["a"] == {"used": SPARE + 3, "replaced": 100 - SPARE - 3}
+    assert [round(group.by_camera["a"].taken_s / FRAME_S) for group in out] == list(range(100 - MAX_COMPLETE - 3, 100))
+    assert rig.counts["a"] == {"used": MAX_COMPLETE + 3, "replaced": 100 - MAX_COMPLETE - 3}
 
 
 def test_the_line_follows_cameras_of_another_rate():

@@ -14,7 +14,7 @@ from reference.ball import photograph
 from reference.ball_rig import CAMERAS, make_rig, rig_text
 
 from viewmend.cli import main
-from viewmend.contrib.live_rig.frames import RigSource
+from viewmend.contrib.live_rig.rig_source import RigFileSource
 from viewmend.data.errors import CaptureError
 from viewmend.live.client import Publisher
 
@@ -30,7 +30,7 @@ def newest(supply):
 
 
 @contextmanager
-def reading(supply: RigSource) -> Iterator[None]:
+def reading(supply: RigFileSource) -> Iterator[None]:
     """The supply alone, without a server."""
     supply.start()
     try:
@@ -46,7 +46,7 @@ def of_all(supply):
 
 
 def test_videos_as_if_live_are_masked_and_together_and_shown(rig):
-    supply = RigSource(rig, align=False)
+    supply = RigFileSource(rig, align=False)
     with running(supply, ready=False) as server:
         wait_until(lambda: server.service.is_ready and of_all(supply) is not None)
         frame, truth = of_all(supply), photograph(CAMERAS)
@@ -67,7 +67,7 @@ def test_videos_as_if_live_are_masked_and_together_and_shown(rig):
 
 def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
     caplog.set_level(logging.WARNING)
-    supply = RigSource(rig, align=False)
+    supply = RigFileSource(rig, align=False)
     with reading(supply):
         wait_until(lambda: of_all(supply) is not None)
         before = supply.rig.number
@@ -85,27 +85,27 @@ def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
 
 def test_what_was_lost_since_the_last_line_is_said_and_no_more(rig, caplog, monkeypatch):
     caplog.set_level(logging.WARNING)
-    supply = RigSource(rig, align=False)
+    supply = RigFileSource(rig, align=False)
     for late, torn in ((3, 0), (5, 1), (5, 1), (0, 0), (1, 0)):  # then the camera was opened anew
         told = {"c0": {"late": late, "torn": torn, "used": 90}, "c1": {"used": 90}}
         monkeypatch.setattr(supply, "camera_counts", lambda told=told: told)
-        supply._report()
+        supply._report_losses()
     said = [message.split(": ", 1)[1] for message in caplog.messages]
     assert said == ["c0 3 late", "c0 2 late, 1 torn", "c0 1 late"]
 
 
 def test_what_is_wrong_is_said_once_until_something_else_is(rig, caplog):
     caplog.set_level(logging.WARNING)
-    supply, told = RigSource(rig, align=False), []
+    supply, told = RigFileSource(rig, align=False), []
     supply.changed = lambda: told.append(supply.status.error)
     for error in ("no light", "no light", "no power"):
-        supply._is_wrong(error)
+        supply._set_error(error)
     assert caplog.messages == ["no light", "no power"], "on the terminal"
     assert told == ["no light", "no light", "no power"] and supply.status.state == "failing"
 
 
 def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
-    supply = RigSource(rig, align=False)
+    supply = RigFileSource(rig, align=False)
     worker, unplugged = supply._workers["c2"], threading.Event()
     connect = worker._connect
 
@@ -129,15 +129,15 @@ def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
 
 
 def test_without_a_subject_the_background_is_shown(rig):
-    supply, gone = RigSource(rig, align=False), threading.Event()
+    supply, gone = RigFileSource(rig, align=False), threading.Event()
     show = supply._show
 
-    def show_with_or_without(together):
+    def show_with_or_without(group):
         if gone.is_set():
-            for name, taken in together.taken.items():
+            for name, taken in group.by_camera.items():
                 images = replace(taken.images, mask=np.zeros_like(taken.images.mask))
-                together.taken[name] = replace(taken, images=images)
-        show(together)
+                group.by_camera[name] = replace(taken, images=images)
+        show(group)
 
     supply._show = show_with_or_without
     with reading(supply):
@@ -155,4 +155,4 @@ def test_a_rig_that_cannot_be_is_one_line_before_any_address(rig, capsys):
     said = capsys.readouterr().err
     assert "camera 'c3': expected a video, got: No such file or directory" in said and said.count("\n") == 1
     with pytest.raises(CaptureError, match="expected a rig's TOML file"):
-        RigSource(rig.parent / "none.toml")
+        RigFileSource(rig.parent / "none.toml")

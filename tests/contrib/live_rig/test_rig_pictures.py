@@ -13,17 +13,11 @@ import numpy as np
 import pytest
 from reference.films import picture, set_matrix, write_film
 
-from viewmend.contrib.live_rig import frame_readers as pictures
-from viewmend.contrib.live_rig.frame_readers import (
-    Playback,
-    SenderClock,
-    _KernelStamps,
-    _SenderStamps,
-    _Stamps,
-    _Whole,
-    pictures_of,
-)
+from viewmend.contrib.live_rig import frame_readers, frame_times
+from viewmend.contrib.live_rig.frame_readers import DamageFilter, Playback, read_pictures
+from viewmend.contrib.live_rig.frame_times import ArrivalTimes, DriverTimes, SenderTimes
 from viewmend.contrib.live_rig.rig_file import read_rig
+from viewmend.contrib.live_rig.sender_clock import SenderClock
 from viewmend.data.video_clock import Track
 from viewmend.data.videos import to_rgb
 
@@ -47,7 +41,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(pictures, "time", clock)
+    monkeypatch.setattr(frame_readers, "time", clock)
+    monkeypatch.setattr(frame_times, "time", clock)
     return clock
 
 
@@ -70,7 +65,7 @@ def playback(clock):
 
 
 def test_a_recording_is_played_in_time_over_and_over(camera, clock, playback):
-    with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
+    with closing(read_pictures(camera, Counter(), playback, clock.wait)) as played:
         taken = [next(played) for _ in range(20)]
     assert [round(FPS * (p.taken_s - 1000)) for p in taken] == list(range(20))
     shades = [shade(p.frame) for p in taken]
@@ -79,7 +74,7 @@ def test_a_recording_is_played_in_time_over_and_over(camera, clock, playback):
 
 def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out(camera, clock, playback):
     clock.now += 8 / FPS + 0.31
-    with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
+    with closing(read_pictures(camera, Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 + 1.2)
         clock.now += 0.25  # somebody was slow
         assert next(played).taken_s == pytest.approx(1000 + 1.4)
@@ -103,13 +98,13 @@ def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
     turned = set_matrix(write_film(tmp_path / "b.mp4", frames), "turned by 90 degrees")
     shown = []
     for path in (upright, turned):
-        with closing(pictures_of(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)) as played:
+        with closing(read_pictures(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)) as played:
             shown.append(to_rgb(next(played).frame))
     assert (np.rot90(shown[0], -1) == shown[1]).all()
 
 
 def test_an_offset_is_taken_off(camera, clock, playback):
-    with closing(pictures_of(replace(camera, offset_s=0.03), Counter(), playback, clock.wait)) as played:
+    with closing(read_pictures(replace(camera, offset_s=0.03), Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 - 0.03)
 
 
@@ -118,7 +113,7 @@ def test_an_offset_is_taken_off(camera, clock, playback):
 )
 def test_addresses_where_nothing_is_are_said_without_their_secrets(camera, url, said):
     with pytest.raises(OSError) as error:
-        next(pictures_of(replace(camera, url=url), Counter(), Playback(), bool))
+        next(read_pictures(replace(camera, url=url), Counter(), Playback(), bool))
     assert said in str(error.value) and "token" not in str(error.value)
 
 
@@ -131,44 +126,44 @@ def packet_of(at_s):
 
 
 def test_the_senders_clock_is_learnt_from_packets_that_were_waited_for():
-    stamps = _SenderStamps()
-    stamps.saw(packet_of(70.0), 5.0, False)  # lay in a queue: says nothing
-    assert stamps.taken_s(frame_of(70.0), 5.0) is None
-    stamps.saw(packet_of(70.1), 5.02, True)
-    assert stamps.taken_s(frame_of(70.0), 5.0) == pytest.approx(4.92)
+    times = SenderTimes()
+    times.add_packet(packet_of(70.0), 5.0, False)  # lay in a queue: says nothing
+    assert times.taken_s(frame_of(70.0), 5.0) is None
+    times.add_packet(packet_of(70.1), 5.02, True)
+    assert times.taken_s(frame_of(70.0), 5.0) == pytest.approx(4.92)
 
 
 def test_a_packet_that_is_given_when_a_later_one_comes_came_before():
-    stamps = _SenderStamps(lag=2)
+    times = SenderTimes(lag_packets=2)
     for n in range(4):  # that of 70.0 is given when that of 70.2 comes
-        stamps.saw(packet_of(70 + n / 10), 5.2 + n / 10, True)
-    assert stamps.taken_s(frame_of(70.3), 5.5) == pytest.approx(5.3)
+        times.add_packet(packet_of(70 + n / 10), 5.2 + n / 10, True)
+    assert times.taken_s(frame_of(70.3), 5.5) == pytest.approx(5.3)
 
 
 def test_a_driver_that_keeps_the_kernels_time_is_believed(clock, monkeypatch):
     monkeypatch.setattr(clock, "time", lambda: 5e8, raising=False)
-    stamps = _KernelStamps()
-    assert stamps.taken_s(frame_of(999.95), 1000.0) == 999.95
-    assert stamps.taken_s(frame_of(5e8 - 0.04), 1000.0) == pytest.approx(999.96)
-    assert stamps.taken_s(frame_of(3.0), 1000.0) is None, "of another clock, which is not known yet"
+    times = DriverTimes()
+    assert times.taken_s(frame_of(999.95), 1000.0) == 999.95
+    assert times.taken_s(frame_of(5e8 - 0.04), 1000.0) == pytest.approx(999.96)
+    assert times.taken_s(frame_of(3.0), 1000.0) is None, "of another clock, which is not known yet"
 
 
 def test_a_picture_of_the_same_time_is_counted_once():
-    stamps, counts = _Stamps(), Counter()
-    assert [stamps.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [True, False, True, True, True]
+    times, counts = ArrivalTimes(), Counter()
+    assert [times.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [True, False, True, True, True]
     assert counts["duplicated"] == 1
 
 
 def test_what_is_built_on_a_torn_picture_waits_for_a_key_picture():
     counts = Counter()
-    whole = _Whole(counts)
-    assert not whole.is_good(frame_of(0, corrupt=True), False, 0.0) and not counts["torn"], "entered in its middle"
-    assert whole.is_good(frame_of(0, key=True), False, 0.1)
-    assert not whole.is_good(frame_of(0, corrupt=True), False, 0.2)
-    assert not whole.is_good(frame_of(0), False, 0.3)
-    assert whole.is_good(frame_of(0, key=True), False, 0.4) and whole.is_good(frame_of(0), False, 0.5)
-    assert not whole.is_good(frame_of(0), True, 0.6)
-    assert whole.is_good(frame_of(0), False, 2.7), "some streams have no key pictures"
+    damage = DamageFilter(counts)
+    assert not damage.accepts(frame_of(0, corrupt=True), False, 0.0) and not counts["torn"], "entered in its middle"
+    assert damage.accepts(frame_of(0, key=True), False, 0.1)
+    assert not damage.accepts(frame_of(0, corrupt=True), False, 0.2)
+    assert not damage.accepts(frame_of(0), False, 0.3)
+    assert damage.accepts(frame_of(0, key=True), False, 0.4) and damage.accepts(frame_of(0), False, 0.5)
+    assert not damage.accepts(frame_of(0), True, 0.6)
+    assert damage.accepts(frame_of(0), False, 2.7), "some streams have no key pictures"
     assert counts["torn"] == 3
 
 
@@ -211,7 +206,10 @@ def test_a_damaged_stream_shows_no_damaged_picture(camera):
         threading.Thread(target=server.handle_request, daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}/"
         network = replace(camera, url=url, clock="arrival")
-        with pytest.raises(OSError, match="ended"), closing(pictures_of(network, counts, Playback(), bool)) as received:
+        with (
+            pytest.raises(OSError, match="ended"),
+            closing(read_pictures(network, counts, Playback(), bool)) as received,
+        ):
             shown.extend(picture.frame.to_ndarray(format="rgb24").astype(float) for picture in received)
     assert counts["torn"] >= 2 and 10 <= len(shown) <= 26
     away = [min(np.abs(image - other).mean() for other in sent) for image in shown]
@@ -228,31 +226,31 @@ def test_delays_do_not_move_a_picture():
     clock = SenderClock()
     for n in range(100):
         delay_s = 0.02 + (0.3 if n % 7 else 0.0)
-        clock.saw(500 + n * FRAME_S, 7 + n * FRAME_S + delay_s)
+        clock.add_packet(500 + n * FRAME_S, 7 + n * FRAME_S + delay_s)
         if n:
-            assert abs(clock.here_s(500 + n * FRAME_S) - (7 + n * FRAME_S + 0.02)) < 1e-9
+            assert abs(clock.to_local_s(500 + n * FRAME_S) - (7 + n * FRAME_S + 0.02)) < 1e-9
 
 
 def test_a_clock_that_runs_wrong_is_followed():
     clock, ppm = SenderClock(), 200e-6
     for n in range(15 * 600):
         at_s = n * FRAME_S
-        clock.saw(at_s * (1 + ppm), at_s + 0.01)
-    assert abs(clock.here_s(at_s * (1 + ppm)) - (at_s + 0.01)) < 0.003  # of a drift of 120 ms
+        clock.add_packet(at_s * (1 + ppm), at_s + 0.01)
+    assert abs(clock.to_local_s(at_s * (1 + ppm)) - (at_s + 0.01)) < 0.003  # of a drift of 120 ms
 
 
 def test_a_sender_that_begins_anew_is_found_at_once():
     for restart_s in (0.0, 9000.0):
         clock = SenderClock()
         for n in range(30):
-            clock.saw(100 + n * FRAME_S, n * FRAME_S)
-        clock.saw(restart_s, 5.0)
-        assert clock.here_s(restart_s) == 5.0
+            clock.add_packet(100 + n * FRAME_S, n * FRAME_S)
+        clock.add_packet(restart_s, 5.0)
+        assert clock.to_local_s(restart_s) == 5.0
 
 
 def test_a_stall_of_the_network_is_no_new_beginning():
     clock = SenderClock()
     for n in range(30):
-        clock.saw(n * FRAME_S, n * FRAME_S)
-    clock.saw(30 * FRAME_S, 30 * FRAME_S + 3.0)
-    assert abs(clock.here_s(30 * FRAME_S) - 30 * FRAME_S) < 1e-9
+        clock.add_packet(n * FRAME_S, n * FRAME_S)
+    clock.add_packet(30 * FRAME_S, 30 * FRAME_S + 3.0)
+    assert abs(clock.to_local_s(30 * FRAME_S) - 30 * FRAME_S) < 1e-9

@@ -10,8 +10,10 @@ import torch
 from live.live_servers import CAMERAS, PIPELINE, WAIT_S, FakeClock, wait_until
 from reference.ball import BallCapture, photograph
 
-from viewmend.contrib.ray import shared_frames
-from viewmend.contrib.ray.shared_frames import Ingest, SharedFrame, SharedSource
+from viewmend.contrib.ray import shared_frame
+from viewmend.contrib.ray.ingest import Ingest
+from viewmend.contrib.ray.shared_frame import SharedFrame
+from viewmend.contrib.ray.shared_source import SharedSource
 from viewmend.frame_cache import cache_frame
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.poses import view_camera
@@ -133,8 +135,8 @@ def follow():
 @pytest.fixture
 def carved(monkeypatch):
     """The frames whose hulls were carved."""
-    frames, carve = [], shared_frames.cache_frame
-    monkeypatch.setattr(shared_frames, "cache_frame", lambda *given: frames.append(given[0].time) or carve(*given))
+    frames, carve = [], shared_frame.cache_frame
+    monkeypatch.setattr(shared_frame, "cache_frame", lambda *given: frames.append(given[0].time) or carve(*given))
     return frames
 
 
@@ -252,14 +254,14 @@ def test_frames_of_a_live_rig_appear_once_they_are_prepared(follow, monkeypatch)
     pushed, frame, link, source = pushing(follow, now=clock)
     fetch(source, 0)
     wait_until(lambda: link.ingest._led == 0)
-    is_carving, may_carve, carve = threading.Event(), threading.Event(), shared_frames.cache_frame
+    is_carving, may_carve, carve = threading.Event(), threading.Event(), shared_frame.cache_frame
 
     def carve_later(*given):
         is_carving.set()
         may_carve.wait()
         return carve(*given)
 
-    monkeypatch.setattr(shared_frames, "cache_frame", carve_later)
+    monkeypatch.setattr(shared_frame, "cache_frame", carve_later)
     pushed.add(frame)
     assert is_carving.wait(60)
     version = link.ingest._version

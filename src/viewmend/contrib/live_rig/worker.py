@@ -5,9 +5,8 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from queue import Empty, Queue
-from typing import Any
 
 import numpy as np
 
@@ -20,8 +19,19 @@ from viewmend.preprocess.masks.maker import MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
 
+FIRST_PAUSE_S = 0.1
+"""The first pause between attempts to connect, in seconds; it doubles each time."""
+MAX_PAUSE_S = 1.0
+"""The longest pause between attempts to connect, in seconds."""
+POLL_S = 0.2
+"""The masking thread checks at this interval, in seconds, whether it has to end."""
+PERIOD_GAIN = 0.05
+"""The estimated interval between images moves by this fraction of its difference from the newest one."""
 
-def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
+log = logging.getLogger("viewmend.live")
+
+
+def reduce_image(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
     """The image resized to this width and height; unchanged if it has them."""
     import cv2
 
@@ -49,16 +59,7 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
     if plate.shape[1::-1] != camera.taken_px:
         expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
         raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
-    return PlateMasks(reduced(plate, mask_size_px(camera)))
-
-
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
-"""Pause between attempts to connect; it doubles each time."""
-TAKE_S = 0.2
-PERIOD_FOLLOWS = 0.05
-"""Weight of the newest interval in the estimate of the interval between images."""
-
-log = logging.getLogger("viewmend.live")
+    return PlateMasks(reduce_image(plate, mask_size_px(camera)))
 
 
 class CameraWorker:
@@ -67,7 +68,7 @@ class CameraWorker:
     def __init__(
         self,
         camera: LiveCamera,
-        connect: Callable[["CameraWorker"], Any],
+        connect: Callable[["CameraWorker"], Generator[Picture, None, None]],
         deliver: Callable[[str, float, CameraImages], None],
         wants: Callable[[float, float], bool],
     ) -> None:
@@ -84,7 +85,9 @@ class CameraWorker:
         """Why not, or what is wrong with its images."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
-        self._connect, self._deliver, self._wants = connect, deliver, wants
+        self._connect = connect
+        self._deliver = deliver
+        self._wants = wants
         self._since_s = time.monotonic()
         """When `up` changed last."""
         self._last_s: float | None = None
@@ -126,32 +129,44 @@ class CameraWorker:
                 with contextlib.closing(self._connect(self)) as pictures:
                     for picture in pictures:
                         if not self.up:
-                            gone_s, pause_s = time.monotonic() - self._since_s, FIRST_PAUSE_S
-                            self.up, self.error, self._since_s = True, None, time.monotonic()
-                            self.counts["connects"] += 1
-                            log.warning("camera '%s' is there, after %.1f s", self.camera.name, gone_s)
+                            pause_s = FIRST_PAUSE_S
+                            self._note_connection()
                         self._offer(picture)
                         if self._stopped.is_set():
                             return
                 if not self._stopped.is_set():
-                    self._is_down("its pictures have ended")
+                    self._note_failure("its images have ended")
             except Exception as error:  # any failure is reported, and the camera tried again
-                self._is_down(str(error) or type(error).__name__)
+                self._note_failure(str(error) or type(error).__name__)
             if self.wait(began_s + pause_s - time.monotonic()):
                 return
-            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+            pause_s = min(2 * pause_s, MAX_PAUSE_S)
+
+    def _note_connection(self) -> None:
+        now_s = time.monotonic()
+        log.warning("camera '%s' is connected, after %.1f s", self.camera.name, now_s - self._since_s)
+        self.up = True
+        self.error = None
+        self._since_s = now_s
+        self.counts["connects"] += 1
+
+    def _note_failure(self, reason: str) -> None:
+        if self.up:
+            self._since_s = time.monotonic()
+        self.up = False
+        self._report(reason)
 
     def work(self) -> None:
         """Process the newest image, again and again, until stopped."""
         while not self._stopped.is_set():
             try:
-                picture = self._newest.get(timeout=TAKE_S)
+                picture = self._newest.get(timeout=POLL_S)
                 images = self._images(picture)
             except Empty:
                 continue
             except ValueError as error:
                 self.counts["refused"] += 1
-                self._say(str(error))
+                self._report(str(error))
                 continue
             self._deliver(self.camera.name, picture.taken_s, images)
 
@@ -159,7 +174,8 @@ class CameraWorker:
         """The reduced and undistorted image, and its mask; ValueError for a size that is not the calibration's."""
         import cv2
 
-        frame, camera = picture.frame, self.camera.calibration
+        frame = picture.frame
+        camera = self.camera.calibration
         size = (frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)
         if size != self.camera.taken_px:
             expected = "{} x {}".format(*self.camera.taken_px)
@@ -169,14 +185,14 @@ class CameraWorker:
             )
         size_px = camera.width, camera.height
         rgb = to_rgb(frame, size_px)
-        mask = cv2.resize(self._masks.mask(reduced(rgb, mask_size_px(self.camera))), size_px)
+        mask = cv2.resize(self._masks.mask(reduce_image(rgb, mask_size_px(self.camera))), size_px)
         return self._undistortion.apply(CameraImages(rgb, np.asarray(mask, np.uint8), None))
 
     def _offer(self, picture: Picture) -> None:
         """Pass on an image if its time is wanted."""
         if self._last_s is not None and 0 < picture.taken_s - self._last_s < 1:
             step_s = picture.taken_s - self._last_s
-            self._period_s += PERIOD_FOLLOWS * (step_s - self._period_s) if self._period_s else step_s
+            self._period_s += PERIOD_GAIN * (step_s - self._period_s) if self._period_s else step_s
         self._last_s = picture.taken_s
         self.counts["read"] += 1
         if not self._wants(picture.taken_s, self._period_s):
@@ -187,13 +203,7 @@ class CameraWorker:
             self.counts["replaced"] += 1
         self._newest.put(picture)
 
-    def _is_down(self, reason: str) -> None:
-        if self.up:
-            self._since_s = time.monotonic()
-        self.up = False
-        self._say(reason)
-
-    def _say(self, error: str) -> None:
+    def _report(self, error: str) -> None:
         """Report an error, once until it changes."""
         if error != self.error:
             log.warning("camera '%s': %s", self.camera.name, error)

@@ -10,7 +10,7 @@ from viewmend.evaluation.runner import Runs, Task
 from viewmend.evaluation.scene_run import RunSettings, SceneRun, evaluate_scene
 
 ANSWER_S = 5.0
-"""A cluster answers within this time."""
+"""A cluster has to answer within this many seconds."""
 LOCAL = "local"
 """Instead of an address: a cluster of this machine alone, for as long as the run lasts."""
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
@@ -81,7 +81,8 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Ru
         evaluate = ray.remote(**cost)(_evaluate_on_one_core)
         waiting = {evaluate.remote(task, settings): task for task in tasks}
         while waiting:
-            (done, *_), _ = ray.wait(list(waiting))
+            finished, _ = ray.wait(list(waiting))
+            done = finished[0]
             task = waiting.pop(done)
             try:
                 yield task, ray.get(done)

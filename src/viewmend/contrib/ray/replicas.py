@@ -14,7 +14,9 @@ from typing import Any
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from viewmend.contrib.ray.cluster import LOCAL, connect, find_ray
-from viewmend.contrib.ray.shared_frames import Ingest, SharedFrame, SharedSource, SourceState
+from viewmend.contrib.ray.ingest import Ingest, SourceState
+from viewmend.contrib.ray.shared_frame import SharedFrame
+from viewmend.contrib.ray.shared_source import SharedSource
 from viewmend.live.frame_source import FrameSource
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
@@ -27,17 +29,21 @@ from viewmend.utils.heap import configure_allocator, freeze_loaded_objects
 NAME = "viewmend"
 """Serve's name for the application."""
 ANSWER_S = 30.0
-"""Extra timeout for calls of the ingest, which may be computing a hull."""
+"""A call of the ingest may take this many seconds longer than it waits: it may be computing a hull."""
 READY_S = 120.0
-"""A replica accepts viewers after its first rendered view, or after this time."""
+"""A replica accepts viewers after its first rendered view, or after this many seconds."""
 SPARE_REQUESTS = 8
-"""Requests per replica in addition to its viewers: images, paths, /health."""
+"""A replica takes this many requests in addition to its viewers: images, paths, /health."""
 WELL_FILLED = 0.75
 """Replicas are added if more than this fraction of all viewers' places is taken."""
 STOPPING_S = 5.0
-INGEST_SHARE, REPLICAS_SHARE = 0.4, 0.4
-"""Fractions of the store for frames of the ingest, and for older frames that a machine's replicas still use."""
-REPLICAS_A_MACHINE = 8
+"""A replica that stops has this many seconds to end its requests."""
+INGEST_SHARE = 0.4
+"""The ingest's frames take at most this fraction of the store."""
+REPLICAS_SHARE = 0.4
+"""Older frames that a machine's replicas still use take at most this fraction of the store."""
+REPLICAS_PER_MACHINE = 8
+"""The store is divided as if a machine had at most this many replicas."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +64,7 @@ class ManyViewers:
     @property
     def replica_mb(self) -> float:
         """Shared memory per replica."""
-        return REPLICAS_SHARE * self.store_mb / min(self.replicas[1], REPLICAS_A_MACHINE)
+        return REPLICAS_SHARE * self.store_mb / min(self.replicas[1], REPLICAS_PER_MACHINE)
 
 
 class IngestActor:
@@ -66,7 +72,8 @@ class IngestActor:
 
     def __init__(self, served: ManyViewers, put: Callable[[SharedFrame], Any]) -> None:
         configure_allocator()
-        self._served, self._put = served, put
+        self._served = served
+        self._put = put
         self._opening = threading.Lock()
         self._ingest: Ingest | None = None
 
@@ -81,9 +88,10 @@ class IngestActor:
     def _opened(self) -> Ingest:
         with self._opening:
             if self._ingest is None:
-                served, kept_mb = self._served, INGEST_SHARE * self._served.store_mb
-                source, inpainter = served.open_source(), served.load_inpainter()
-                self._ingest = Ingest(source, inpainter, served.stream.hull, kept_mb, self._put)
+                served = self._served
+                source = served.open_source()
+                inpainter = served.load_inpainter()
+                self._ingest = Ingest(source, inpainter, served.stream.hull, INGEST_SHARE * served.store_mb, self._put)
                 freeze_loaded_objects()
             return self._ingest
 
@@ -121,7 +129,8 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
         ValueError: Ray is not installed, there is no cluster, Serve runs on it, or the source cannot be read.
         OSError: the port is in use.
     """
-    host, port = served.server.host, _free_port(served.server.host, served.server.port)
+    host = served.server.host
+    port = _free_port(host, served.server.port)
     ray = find_ray(address)
     logging.getLogger("ray").setLevel(logging.ERROR)
     connect(ray, address, num_cpus=served.replicas[1] + 1, object_store_memory=int(1e6 * served.store_mb))
@@ -159,9 +168,10 @@ def _application(serve: Any, served: ManyViewers, ingest: Any) -> Any:
     def build() -> StartWhenReady:
         return _replica(served, RayIngest(ingest))
 
-    viewers, (fewest, most) = served.server.limits.viewers, served.replicas
+    viewers = served.server.limits.viewers
+    min_replicas, max_replicas = served.replicas
     target = max(1, math.floor(WELL_FILLED * viewers))
-    scaling = {"min_replicas": fewest, "initial_replicas": fewest, "max_replicas": most}
+    scaling = {"min_replicas": min_replicas, "initial_replicas": min_replicas, "max_replicas": max_replicas}
     deployment = serve.deployment(
         name="replica",
         ray_actor_options={"num_cpus": 1, "num_gpus": 1 if served.device.startswith("cuda") else 0},
@@ -178,7 +188,8 @@ class StartWhenReady:
 
     def __init__(self, app: ASGIApp, ready: Callable[[], Awaitable[None]]) -> None:
         """Wrap an application; `ready` returns when viewers may connect."""
-        self._app, self._ready = app, ready
+        self._app = app
+        self._ready = ready
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As ASGI specifies."""
@@ -200,7 +211,8 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
     configure_allocator()
     source = SharedSource(ingest, served.replica_mb / 2)
     stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
-    inpainter, in_page = served.load_inpainter(), served.server.draws_in_page
+    inpainter = served.load_inpainter()
+    in_page = served.server.draws_in_page
     error_model = error_model_for(inpainter, served.device)
     renderer = Renderer(source, inpainter, stream, served.device, error_model, draws_in_page=in_page)
     service = RenderService(renderer, source)

@@ -1,4 +1,4 @@
-"""The broadcast: one viewer controls a view that is encoded once, as HLS, for any number of browsers at /watch."""
+"""The broadcast, an extension of the live server: one viewer controls a view that any number of browsers watch."""
 
 import asyncio
 import contextlib
@@ -7,19 +7,16 @@ import math
 import re
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
-from fractions import Fraction
 from functools import partial
-from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 from msgspec.structs import replace
 from starlette.requests import Request
 from starlette.responses import Response
 
-from viewmend.data.videos import tag_colours
+from viewmend.contrib.broadcast.hls import PLAYLIST, HlsSegmenter
 from viewmend.geometry.threads import light_operations
 from viewmend.live.encoding import Image, draw_mode
 from viewmend.live.extension import Extension
@@ -32,140 +29,22 @@ from viewmend.live.sessions import PlaybackState, ViewerSession
 from viewmend.live.video import video_codecs
 from viewmend.models.base import State
 
-if TYPE_CHECKING:
-    from av import Packet
-
-PLAYLIST, INIT = "live.m3u8", "init.mp4"
-FIRST, LISTED = 3, 6
-"""Fewest and most segments of the playlist: players start three before its end, and some refuse a shorter one."""
-KEPT = 10
-"""Segments that are kept, also for players with an older playlist."""
-BITS_PER_S = 8_000_000
-"""Peak bit rate, and encoder buffer: a segment has at most 2 MB."""
-MUXER = {
-    "hls_time": "1",
-    "hls_list_size": str(LISTED),
-    "hls_segment_type": "fmp4",
-    "hls_fmp4_init_filename": INIT,
-    "hls_segment_filename": "memory://%d.m4s",
-    "hls_flags": "independent_segments+discont_start",
-    "hls_start_number_source": "epoch",  # numbering continues after a restart: segment names are unique
-}
-ENCODER = {
-    "preset": "veryfast",
-    "tune": "zerolatency",
-    "profile": "main",
-    "crf": "21",
-    "maxrate": str(BITS_PER_S),
-    "bufsize": str(BITS_PER_S),
-}
-
-
-class FilmSegments:
-    """An endless video of one size, as HLS: a playlist and segments of one second, H.264 in fragmented MP4, in memory.
-
-    A context manager. Its files can be read from any thread.
-    """
-
-    def __init__(self, size_px: tuple[int, int], fps: int) -> None:
-        import av
-        from av.video.stream import VideoStream
-
-        self._size_px, self._fps = size_px, fps
-        self._files: dict[str, bytes] = {}
-        self._segments: deque[str] = deque()
-        self._second = -1
-        self._held: list[Packet] = []
-        opened = partial(_File, self)
-        self._container = av.open(f"memory://{PLAYLIST}", "w", format="hls", io_open=opened, options=MUXER)
-        stream = self._container.add_stream("libx264", rate=fps)
-        assert isinstance(stream, VideoStream), "that encoder is a video's"
-        stream.width, stream.height = size_px
-        stream.pix_fmt = "yuv420p"
-        tag_colours(stream.codec_context)
-        stream.time_base = stream.codec_context.time_base = Fraction(1, fps)
-        stream.codec_context.gop_size = 10 * fps  # `add` says where key frames are
-        stream.codec_context.thread_count = 1
-        stream.options = {**ENCODER}
-        self._stream = stream
-
-    def __enter__(self) -> "FilmSegments":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._mux([*self._stream.encode(None)])
-        self._container.mux(self._held)
-        self._container.close()
-
-    def add(self, picture: Image, at: int) -> None:
-        """Append an image.
-
-        Args:
-            picture: RGB; one of another size is resized.
-            at: its time, in frames since the beginning; later than the last.
-        """
-        import cv2
-        from av import VideoFrame
-        from av.video.frame import PictureType
-
-        if picture.shape[1::-1] != self._size_px:
-            picture = cv2.resize(picture, self._size_px, interpolation=cv2.INTER_LINEAR)
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24").reformat(format="yuv420p")
-        second = at // self._fps
-        frame.pts, frame.time_base = at, Fraction(1, self._fps)
-        frame.pict_type = PictureType.I if second != self._second else PictureType.NONE  # where segments can be cut
-        self._second = second
-        self._mux(self._stream.encode(frame))
-
-    def _mux(self, packets: "list[Packet]") -> None:
-        """Write packets, each when the next one arrives and so sets its duration.
-
-        The muxer starts a segment where the last packet before it ends.
-        """
-        for packet in packets:
-            for held in self._held:
-                assert packet.pts is not None and held.pts is not None, "the encoder keeps times"
-                held.duration = packet.pts - held.pts
-            self._container.mux(self._held)
-            self._held = [packet]
-
-    def file(self, name: str) -> bytes | None:
-        """The playlist, the header of all segments, or a segment; None if there is none of that name."""
-        return None if name == PLAYLIST and len(self._segments) < FIRST else self._files.get(name)
-
-    def keep(self, name: str, content: bytes) -> None:
-        """Store a finished file; the oldest segments are dropped."""
-        if name.endswith(".m4s"):
-            self._segments.append(name)
-            while len(self._segments) > KEPT:
-                self._files.pop(self._segments.popleft(), None)
-        self._files[name] = content
-
-
-class _File(BytesIO):
-    """A file that the muxer writes; stored when it is closed."""
-
-    def __init__(self, film: FilmSegments, url: str, flags: int, options: dict[str, str]) -> None:
-        super().__init__()
-        self._name, self._film = url.removeprefix("memory://"), film
-
-    def close(self) -> None:
-        if not self.closed:
-            self._film.keep(self._name, self.getvalue())
-        super().close()
-
-
 UNWATCHED_S = 15.0
-"""Rendering and encoding end this long after the last request for the playlist."""
-MIN_FPS, MAX_FPS = 5, 30
-"""Bounds of the video's frame rate, which is otherwise the source's."""
+"""Rendering and encoding end this many seconds after the last request for the playlist."""
+MIN_FPS = 5
+"""The video has at least this many frames per second."""
+MAX_FPS = 30
+"""The video has at most this many frames per second; in between, it has as many as the source."""
 STILL_FPS = 10
-"""Frame rate if the source has a single frame."""
-FIRST_S = 20.0
-"""Time in which a video has to begin after the first request for its playlist."""
+"""The video has this many frames per second if the source has a single frame."""
+START_S = 20.0
+"""A video has to begin within this many seconds after the first request for its playlist."""
 POLL_S = 0.05
-PLAYLIST_AGE_S, SEGMENT_AGE_S = 1, 60
-"""How long HTTP caches may keep a file."""
+"""Requests and the encoder check at this interval, in seconds, whether they have to go on."""
+PLAYLIST_AGE_S = 1
+"""HTTP caches may keep the playlist for this many seconds."""
+SEGMENT_AGE_S = 60
+"""HTTP caches may keep a segment for this many seconds."""
 
 log = logging.getLogger("viewmend.live")
 
@@ -189,7 +68,8 @@ class BroadcastSession(ViewerSession):
     def close(self) -> None:
         """Drop the image, and any that is still being rendered: the next video must not begin with it."""
         with self._lock:
-            self._is_open, self.image = False, None
+            self._is_open = False
+            self.image = None
 
     def look(self, look: Look) -> None:
         """Show a viewer's look, in the video's size."""
@@ -234,11 +114,13 @@ class Broadcast(Extension):
     notice = "watch {address}/watch{query}   (the view of the viewer who is on air)"
 
     def __init__(self, service: RenderService, config: ServerConfig, size_px: tuple[int, int]) -> None:
-        self._service, self._size_px, self._now = service, size_px, service.now
+        self._service = service
+        self._size_px = size_px
+        self._now = service.now
         self.session = BroadcastSession(service, size_px, config.budget_ms)
         self._director: ViewerSession | None = None
         """The viewer that is on air."""
-        self._film: FilmSegments | None = None
+        self._segmenter: HlsSegmenter | None = None
         self._thread: threading.Thread | None = None
         self._requested_at = -math.inf
         self._stopped = threading.Event()
@@ -294,17 +176,22 @@ class Broadcast(Extension):
 
     async def _file_response(self, request: Request) -> Response:
         """A file of the video; 404 if there is none of this name, 503 if the video does not begin in time."""
-        name, end = request.path_params["name"], self._now() + FIRST_S
-        while (content := self.file(name)) is None and name == PLAYLIST:
-            if self._now() > end or await request.is_disconnected():
+        name = request.path_params["name"]
+        end_s = self._now() + START_S
+        content = self.file(name)
+        while content is None and name == PLAYLIST:
+            if self._now() > end_s or await request.is_disconnected():
                 return error_response(503, "the video did not begin in time; see /health")
             await asyncio.sleep(POLL_S)
+            content = self.file(name)
         if content is None:
             return error_response(404, "the video has no such file, or no longer; reload the playlist")
-        media_type, age_s = "video/mp4", SEGMENT_AGE_S
+        media_type = "video/mp4"
+        age_s = SEGMENT_AGE_S
         if name == PLAYLIST:
             content = add_query(content, token_query(request.query_params.get("token")))
-            media_type, age_s = "application/vnd.apple.mpegurl", PLAYLIST_AGE_S
+            media_type = "application/vnd.apple.mpegurl"
+            age_s = PLAYLIST_AGE_S
         headers = {"Cache-Control": f"max-age={age_s}", "X-Content-Type-Options": "nosniff"}
         return Response(content, media_type=media_type, headers=headers)
 
@@ -323,8 +210,8 @@ class Broadcast(Extension):
             if not self._stopped.is_set() and (self._thread is None or not self._thread.is_alive()):
                 self._thread = threading.Thread(target=self._run, name="broadcast", daemon=True)
                 self._thread.start()
-        film = self._film  # the encoder's thread may remove it meanwhile
-        content = film and film.file(name)
+        segmenter = self._segmenter  # the encoder's thread may remove it meanwhile
+        content = None if segmenter is None else segmenter.file(name)
         if content:
             self.counts.update({"playlists" if name == PLAYLIST else "segments": 1, "bytes": len(content)})
         return content
@@ -342,19 +229,23 @@ class Broadcast(Extension):
             log.exception("while encoding the broadcast")
         finally:
             self._service.leave(self.session)
-            self._film = None
+            self._segmenter = None
             self.session.close()
 
     def _encode(self, fps: int) -> None:
         """Encode the newest image at every frame; if encoding is too slow, frames are left out, in step with time."""
-        with FilmSegments(self._size_px, fps) as film:
-            self._film, start, index = film, self._now(), 0
+        with HlsSegmenter(self._size_px, fps) as segmenter:
+            self._segmenter = segmenter
+            start_s = self._now()
+            index = 0
             while self.is_watched:
-                if (image := self.session.image) is not None:
-                    film.add(image, index)
-                index = max(index + 1, math.ceil((self._now() - start) * fps))
-                while self.is_watched and (wait_s := start + index / fps - self._now()) > 0:
-                    self._stopped.wait(min(wait_s, POLL_S))
+                image = self.session.image
+                if image is not None:
+                    segmenter.add(image, index)
+                index = max(index + 1, math.ceil((self._now() - start_s) * fps))
+                due_s = start_s + index / fps
+                while self.is_watched and self._now() < due_s:
+                    self._stopped.wait(min(due_s - self._now(), POLL_S))
 
 
 def choose_fps(source_fps: float) -> int:

@@ -1,0 +1,136 @@
+"""Synchronisation: groups the cameras' images, which arrive in any order, by the time at which they were taken."""
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from viewmend.data.native_capture import CameraImages
+
+ABSENT_S = 0.5
+"""A group does not wait for cameras that were silent for this many seconds."""
+PHASE_GAIN = 0.05
+"""Each group moves the ticks by this fraction of its cameras' median offset."""
+MAX_COMPLETE = 4
+"""This many complete groups are kept until they are taken; the oldest are dropped."""
+
+
+@dataclass(frozen=True)
+class TimedImages:
+    """One camera's images and when they were taken, on this machine's monotonic clock."""
+
+    taken_s: float
+    images: CameraImages
+
+
+@dataclass
+class ImageGroup:
+    """The cameras' images of one tick."""
+
+    since_s: float
+    """When the first of them arrived."""
+    by_camera: dict[str, TimedImages] = field(default_factory=dict)
+
+    @property
+    def spread_s(self) -> float:
+        """Time between the first and the last exposure."""
+        times = [timed.taken_s for timed in self.by_camera.values()]
+        return max(times) - min(times)
+
+
+@dataclass(frozen=True)
+class Tick:
+    """The tick that is nearest to a time."""
+
+    number: int
+    offset_s: float
+    """The time, relative to the tick."""
+
+
+class Aligner:
+    """Groups images by tick. One thread at a time may call it.
+
+    Ticks are evenly spaced and follow the cameras' own rate and phase. A tick is complete when each camera has an image
+    for it or a later one; absent cameras do not count. An incomplete tick waits for `wait_s`.
+    """
+
+    def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
+        self._interval_s = interval_s
+        self._tolerance_s = tolerance_s
+        self._wait_s = wait_s
+        self._origin_s: float | None = None
+        """Time of tick 0."""
+        self._max_groups = MAX_COMPLETE + math.ceil(wait_s / interval_s)
+        self._groups: dict[int, ImageGroup] = {}
+        self._last_finished = -math.inf
+        """The last tick that was taken or dropped."""
+        self._newest: dict[str, float] = dict.fromkeys(names, -math.inf)
+        """The last tick of each camera."""
+        self._heard_s: dict[str, float] = dict.fromkeys(names, -math.inf)
+        """When each camera was heard of last."""
+        self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
+
+    def wants(self, taken_s: float, period_s: float) -> bool:
+        """Whether an image of a camera with this period is the nearest to a tick."""
+        return period_s > self._interval_s / 1.5 or abs(self._nearest(taken_s).offset_s) <= period_s / 2
+
+    def _nearest(self, taken_s: float) -> Tick:
+        """The tick nearest to a time; the first call sets tick 0."""
+        if self._origin_s is None:
+            self._origin_s = taken_s
+        number = math.floor((taken_s - self._origin_s) / self._interval_s + 0.5)
+        return Tick(number, taken_s - self._origin_s - number * self._interval_s)
+
+    def put(self, name: str, timed: TimedImages, now_s: float) -> None:
+        """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
+        counts = self.counts[name]
+        self._heard_s[name] = now_s
+        if timed.taken_s > now_s + self._interval_s / 2:  # a clock that jumps must not affect the others
+            counts["misaligned"] += 1
+            return
+        tick = self._nearest(timed.taken_s)
+        self._newest[name] = max(self._newest[name], tick.number)
+        if tick.number <= self._last_finished:
+            counts["late"] += 1
+            return
+        if abs(tick.offset_s) > self._tolerance_s:
+            counts["misaligned"] += 1
+            return
+
+        # of two images of one camera, the nearer one is kept
+        group = self._groups.setdefault(tick.number, ImageGroup(now_s))
+        other = group.by_camera.get(name)
+        if other is not None:
+            counts["surplus"] += 1
+        if other is None or abs(tick.offset_s) < abs(self._nearest(other.taken_s).offset_s):
+            group.by_camera[name] = timed
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        while len(self._groups) > self._max_groups:
+            oldest = min(self._groups)
+            for name in self._groups.pop(oldest).by_camera:
+                self.counts[name]["replaced"] += 1
+            self._last_finished = oldest
+
+    def take(self, now_s: float) -> list[ImageGroup]:
+        """Groups that are complete or have waited long enough, the oldest first."""
+        taken: list[ImageGroup] = []
+        present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - ABSENT_S}
+        for tick in sorted(self._groups):
+            group = self._groups[tick]
+            is_incomplete = any(self._newest[name] < tick for name in present)
+            if is_incomplete and now_s < group.since_s + self._wait_s:
+                break
+            del self._groups[tick]
+            self._last_finished = tick
+            for name in group.by_camera:
+                self.counts[name]["used"] += 1
+            for name in present - group.by_camera.keys():
+                self.counts[name]["missing"] += 1
+            offsets_s = [self._nearest(timed.taken_s).offset_s for timed in group.by_camera.values()]
+            assert self._origin_s is not None, "an image has set it"
+            self._origin_s += PHASE_GAIN * statistics.median(offsets_s)
+            taken.append(group)
+        return taken

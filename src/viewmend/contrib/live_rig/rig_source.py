@@ -1,0 +1,278 @@
+"""The frame source of `viewmend serve rig.toml`: cameras that this machine reads itself."""
+
+import logging
+import threading
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from viewmend.contrib.live_rig.aligner import Aligner, ImageGroup, TimedImages
+from viewmend.contrib.live_rig.frame_readers import Picture, Playback, read_pictures
+from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
+from viewmend.contrib.live_rig.worker import CameraWorker
+from viewmend.data.native_capture import CameraImages, pinhole_cameras, stack_images
+from viewmend.data.prepare import PreparedCapture, prepare
+from viewmend.data.source import MemoryCapture
+from viewmend.data.video_clock import video_track
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.live.frame_source import SourceStatus
+from viewmend.live.push import LiveSource
+from viewmend.types import MultiViewFrame
+
+WATCH_S = 1.0
+"""The rig's file is checked for changes at this interval, in seconds."""
+REPORT_S = 30.0
+"""Losses are reported at this interval, in seconds."""
+GATHER_S = 3.0
+"""The first frame, which sets alignment and axes, waits this many seconds for all cameras."""
+REPORTED_EVENTS = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
+"""The events of a camera that are reported as losses."""
+
+log = logging.getLogger("viewmend.live")
+
+
+@dataclass(frozen=True)
+class FileStamp:
+    """Identifies a version of a file."""
+
+    modified_ns: int
+    size_bytes: int
+
+    @classmethod
+    def of(cls, path: Path) -> "FileStamp | None":
+        """The file's present version; None if it does not exist."""
+        try:
+            status = path.stat()
+        except OSError:
+            return None
+        return cls(status.st_mtime_ns, status.st_size)
+
+
+class RigFileSource(LiveSource):
+    """Synchronised frames of the cameras in a `rig.toml`.
+
+    The file is read again when it changes: cameras are added, removed and replaced while the others continue.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        fps: float | None = None,
+        memory_mb: float = 500.0,
+        max_image_size: int | None = None,
+        align: bool = True,
+        match_colours: bool = True,
+    ) -> None:
+        """Read the rig; its cameras are opened by `start`.
+
+        Raises:
+            CaptureError: the rig's file, its calibration, a clean plate or a recording cannot be used.
+        """
+        super().__init__(fps, memory_mb)
+        self.status = SourceStatus(error="waiting for the cameras")
+        self._path = path
+        self._max_image_size = max_image_size
+        self._align = align
+        self._match_colours = match_colours
+        self._lock_cameras = threading.Condition()
+        self._playback = Playback()
+        self._aligner = Aligner((), 1.0, 1.0, 1.0)
+        self._workers: dict[str, CameraWorker] = {}
+        self._new_workers: list[CameraWorker] = []
+        """Workers that `_begin_rig` starts."""
+        self._gather_until_s: float | None = None
+        self._stopped = False
+        self._stamp = FileStamp.of(path)
+        self._reported: dict[str, dict[str, int]] = {}
+        """The cameras' counts at the last report."""
+        self._prepared: PreparedCapture | None = None
+        """Alignment and colours of this rig; None before its first frame."""
+        self._switch_to(read_rig(path, max_image_size))
+        self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
+
+    def start(self) -> None:
+        """Open the cameras."""
+        self._begin_rig()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and close the cameras."""
+        self._stopped = True
+        with self._lock_cameras:
+            self._lock_cameras.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+        for worker in self._workers.values():
+            worker.ask_to_stop()
+        for worker in self._workers.values():
+            worker.stop()
+
+    def camera_counts(self) -> dict[str, dict[str, int]]:
+        """Event counts of each camera, and whether it is connected."""
+        with self._lock_cameras:
+            return {
+                name: {"up": int(worker.up), **worker.counts, **self._aligner.counts[name]}
+                for name, worker in self._workers.items()
+            }
+
+    def _switch_to(self, rig: LiveRig) -> None:
+        """Switch to this rig. Unchanged cameras continue; new ones are opened by `_begin_rig`.
+
+        Raises:
+            CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
+        """
+        # workers of unchanged cameras are kept
+        unchanged = {repr(camera) for camera in rig.cameras}  # cameras hold arrays, which have no plain equality
+        kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
+        new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}
+        gone = [worker for name, worker in self._workers.items() if name not in kept]
+
+        # recordings are played on one time line
+        recordings = [camera for camera in rig.cameras if camera.is_file]
+        if recordings:
+            self._playback.follow([video_track(camera.name, "images", Path(camera.url)) for camera in recordings])
+
+        names = tuple(camera.name for camera in rig.cameras)
+        aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
+        with self._lock_cameras:
+            aligner.counts.update({name: self._aligner.counts[name] for name in kept})
+            self._rig = rig
+            self._prepared = None
+            self._aligner = aligner
+            workers = kept | new
+            self._workers = {name: workers[name] for name in names}
+        self._cameras = pinhole_cameras([camera.calibration for camera in rig.cameras])
+        self._gather_until_s = None
+        self._new_workers = list(new.values())
+        for worker in gone:
+            worker.ask_to_stop()
+
+    def _make_worker(self, camera: LiveCamera) -> CameraWorker:
+        def connect(worker: CameraWorker) -> Generator[Picture, None, None]:
+            return read_pictures(camera, worker.counts, self._playback, worker.wait)
+
+        def wants(taken_s: float, period_s: float) -> bool:
+            return self._aligner.wants(taken_s, period_s)
+
+        return CameraWorker(camera, connect, self._deliver, wants)
+
+    def _begin_rig(self) -> None:
+        """Announce the rig to viewers, and open its new cameras."""
+        rig = self._rig
+        bounds = None if rig.bounds_m is None else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
+        up = None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32)
+        self.begin(rig.name, rig.fps, bounds, up)
+        for worker in self._new_workers:
+            worker.start()
+
+    def _run(self) -> None:
+        watched_s = time.monotonic()
+        reported_s = watched_s
+        while not self._stopped:
+            try:
+                with self._lock_cameras:
+                    self._lock_cameras.wait(0.1)
+                    groups = self._aligner.take(time.monotonic())
+                for group in groups:
+                    self._show(group)
+            except Exception as error:  # nothing may end the thread
+                self._set_error(f"{type(error).__name__}: {error}"[:400])
+            now_s = time.monotonic()
+            if now_s > watched_s + WATCH_S:
+                watched_s = now_s
+                self._reload_if_changed()
+                self._check_cameras()
+            if now_s > reported_s + REPORT_S:
+                reported_s = now_s
+                self._report_losses()
+
+    def _show(self, group: ImageGroup) -> None:
+        """Add one frame, prepared as in `viewmend mend`."""
+        names = [name for name in self._cameras.names if name in group.by_camera]
+        if len(names) < 2:
+            return
+        if self._prepared is None and len(names) < len(self._cameras) and self._gathers():
+            return
+        images = [group.by_camera[name].images for name in names]
+        frame = stack_images(images, self._cameras.select(names), 0)
+        if self._prepared is None:
+            self._prepared = self._prepare(frame)
+        if self._prepared is None:
+            self.status = replace(self.status, error="the masks are empty: no subject is visible")
+            return
+        self.spread_ms = 1000 * group.spread_s
+        self.add(self._prepared.adjust(frame, "the newest frame"))
+
+    def _gathers(self) -> bool:
+        """Whether the first frame still waits for more cameras."""
+        now_s = time.monotonic()
+        if self._gather_until_s is None:
+            self._gather_until_s = now_s + GATHER_S
+        return now_s < self._gather_until_s
+
+    def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
+        """Check, align and colour-match the rig by its first frame; None while fewer than two cameras see a subject."""
+        assert frame.mask is not None, "live cameras are masked"
+        seeing = (frame.mask.amax((1, 2)) > FOREGROUND).sum()
+        if int(seeing) < 2:
+            return None
+        assert self.rig is not None, "the rig has begun"
+        capture = MemoryCapture(self.rig.name, self._cameras, (frame,), bounds=self.rig.bounds, up=self.rig.up)
+        prepared = prepare(capture, align=self._align, match_colours=self._match_colours)
+        for change in prepared.changes:
+            log.warning("%s", change)
+        return prepared
+
+    def _deliver(self, name: str, taken_s: float, images: CameraImages) -> None:
+        """Add an image to the aligner; the cameras' workers call this."""
+        with self._lock_cameras:
+            if name in self._aligner.counts:  # else the camera has just left the rig
+                self._aligner.put(name, TimedImages(taken_s, images), time.monotonic())
+                self._lock_cameras.notify()
+
+    def _reload_if_changed(self) -> None:
+        """Reload the rig file if it has changed; an invalid file is reported and ignored."""
+        stamp = FileStamp.of(self._path)
+        if stamp == self._stamp:
+            return
+        self._stamp = stamp
+        try:
+            self._switch_to(read_rig(self._path, self._max_image_size))
+        except ValueError as error:
+            log.warning("the rig stays as it was: %s", error)
+            return
+        self._begin_rig()
+        log.warning("the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new_workers))
+
+    def _check_cameras(self) -> None:
+        """Report an error while there are too few cameras."""
+        silent = [worker for worker in self._workers.values() if not worker.up]
+        connected = len(self._workers) - len(silent)
+        if connected < 2:
+            first = f"'{silent[0].camera.name}': {silent[0].error or 'silent'}"
+            self._set_error(f"expected at least two cameras, got {connected}; {first}")
+
+    def _set_error(self, error: str) -> None:
+        """Set the status, and log an error that is not the last one."""
+        if self.status.error != error:
+            log.warning("%s", error)
+        self.status = replace(self.status, state="failing", error=error)
+        self.changed()
+
+    def _report_losses(self) -> None:
+        """Log what was lost since the last report, if anything."""
+        lines: list[str] = []
+        counted = self.camera_counts()
+        for name, counts in counted.items():
+            before = self._reported.get(name, {})
+            new = {event: counts.get(event, 0) - before.get(event, 0) for event in REPORTED_EVENTS}
+            losses = [f"{count} {event}" for event, count in new.items() if count > 0]
+            if losses:
+                lines.append(f"{name} {', '.join(losses)}")
+        self._reported = counted
+        if lines:
+            log.warning("in the last %.0f s: %s", REPORT_S, "; ".join(lines))
