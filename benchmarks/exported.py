@@ -6,16 +6,14 @@ Then one view of 320 x 320 pixels with eight cameras is timed on one thread.
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
 import onnxruntime
+import tests_path  # noqa: F401
 import torch
 from measure import timed, write
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from reference.random_views import holed, images, mended, random_view
 
 from viewmend import Stream, StreamConfig, load_inpainter

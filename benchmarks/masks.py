@@ -1,7 +1,8 @@
 """IoU of masks from `viewmend masks` with a capture's own: python benchmarks/masks.py CAPTURE MASKED."""
 
+import argparse
 import json
-import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +10,12 @@ from viewmend.data.native_capture import open_capture
 
 
 def main() -> None:
-    truth, made = (open_capture(path) for path in sys.argv[1:3])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capture", type=Path, help="a capture with its own masks")
+    parser.add_argument("masked", type=Path, help="the capture written by viewmend masks")
+    options = parser.parse_args()
+    truth = open_capture(options.capture)
+    made = open_capture(options.masked)
     scores: dict[str, list[float]] = {}
     for time, frame_id in enumerate(made.frame_ids):
         found, right = made.read(time), truth.read(truth.frame_ids.index(frame_id))

@@ -4,6 +4,7 @@ Keeps EACH connections of each kind open, and reconnects as soon as the server c
 connections. It runs in a process of its own so that it does not delay the measuring client.
 """
 
+import argparse
 import contextlib
 import socket
 import subprocess
@@ -86,12 +87,21 @@ def crowd(port: int, kind: Kind, ended: threading.Event, opened: list[int], each
 
 
 def main() -> None:
-    port, each, seconds = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-    ended, opened = threading.Event(), [0]
-    threads = [threading.Thread(target=crowd, args=(port, KINDS[k], ended, opened, each)) for k in sys.argv[4:]]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("port", type=int, help="the server's port on this machine")
+    parser.add_argument("each", type=int, help="connections of each kind")
+    parser.add_argument("seconds", type=float, help="duration")
+    parser.add_argument("kinds", nargs="+", choices=list(KINDS), metavar="KIND", help="; ".join(KINDS))
+    options = parser.parse_args()
+    ended = threading.Event()
+    opened = [0]
+    threads = [
+        threading.Thread(target=crowd, args=(options.port, KINDS[kind], ended, opened, options.each))
+        for kind in options.kinds
+    ]
     for thread in threads:
         thread.start()
-    ended.wait(seconds)
+    ended.wait(options.seconds)
     ended.set()
     for thread in threads:
         thread.join()

@@ -8,7 +8,6 @@ import argparse
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections import Counter
 from contextlib import closing
@@ -19,10 +18,9 @@ from typing import Any
 
 import av
 import numpy as np
+import tests_path  # noqa: F401
 from av.filter import Graph
 from measure import write
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from reference.films import MATRICES, picture, set_matrix, write_film
 
 from viewmend.contrib.live_rig.frame_readers import Playback, pictures_of

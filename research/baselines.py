@@ -1,6 +1,6 @@
 """Frame rates of our models and of the published networks, side by side in one run.
 
-    PYTHONPATH=benchmarks python research/baselines.py [--device cuda] [--quick] [--write]
+    python research/baselines.py [--device cuda] [--quick] [--write]
 
 Published networks have random weights, which does not affect their speed. `views` is measured as a stream uses it:
 "views-holes" fills holes only, "views-predicted" and "views-all" refine more, and "views-moving" is what the live page
@@ -16,12 +16,14 @@ import argparse
 import json
 import os
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from itertools import product
 from typing import Any
 
+import benchmarks_path  # noqa: F401
 import torch
 from measure import RESULTS, summarise, synchronise, write
 from stream_adapter import STREAMED, Streamed
@@ -32,7 +34,7 @@ from viewmend.contrib.baselines.online import Clip, OnlineConfig, OnlineInpainte
 from viewmend.contrib.baselines.published import NETWORKS
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig
-from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
+from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
 from viewmend.models.checkpoint import build
 from viewmend.models.classical import Unfilled
 from viewmend.models.network import set_compute_dtype
@@ -53,6 +55,7 @@ RIVAL = ("dstt", "def")
 """The fastest baseline, which is part of every run."""
 
 
+NewContext = Callable[[], ContextProvider]
 StreamedView = Callable[[str], tuple[Streamed, IncompleteView]]
 
 
@@ -100,10 +103,11 @@ class Clocked:
         return found
 
 
-def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider, StreamedView]:
-    """The views of a stream up to `NOW`, and their context, which caches everything but the encoding of `NOW`.
+def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], NewContext, StreamedView]:
+    """The views of a stream up to `NOW`, and two functions.
 
-    Also a function that makes one of `STREAMED` with its crop of the view of `NOW`.
+    The first makes the context of one model, which caches all encodings except those of `NOW`. Models must not share
+    it: each stores encodings of its own sizes. The second makes one of `STREAMED` with its crop of the view of `NOW`.
     """
     studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=NOW + 1, size_px=size))
     assert studio.bounds is not None
@@ -113,10 +117,13 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
     views = [stream.render(target, t) for t in range(NOW + 1)]
     for observation in seen:  # depth belongs to the geometry's time
         observation.depth(observation.frame.cameras.names)
-    memory = [observation.encoded for observation in seen]
 
     def at(time: int, names: tuple[str, ...]) -> ContextViews | None:
         return seen[time].context(names)
+
+    def new_context() -> ContextProvider:
+        memory = defaultdict[int, Memory](dict)
+        return ContextProvider(at, memory=lambda time: {} if time == NOW else memory[time])
 
     def streamed(name: str) -> tuple[Streamed, IncompleteView]:
         rule, fraction = STREAMED[name]
@@ -126,7 +133,7 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
         view, margin_px = judge.render(target, NOW), inpainter.net.crop_margin_px(RenderQuality())
         return inpainter, view if margin_px is None else subject_crop(view, margin_px).of_view(view)
 
-    return views, ContextProvider(at, memory=lambda at: {} if at == NOW else memory[at]), streamed
+    return views, new_context, streamed
 
 
 def ours(name: str, views: list[IncompleteView], context: ContextProvider, device: str, precision: str):
@@ -198,26 +205,30 @@ def setting(view: IncompleteView) -> dict[str, object]:
 
 
 def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
-    views, context, streamed = stage(size, options.device)
+    views, new_context, streamed = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
     wanted = [*product(options.networks, options.framings)]
 
-    def add(name: str, inpainter: Inpainter, state: State, view: IncompleteView = views[NOW]) -> None:
+    def add(name: str, inpainter: Inpainter, state: State, view: IncompleteView, context: ContextProvider) -> None:
         figures[name] = timed_steps(inpainter, state, view, context, options.device, options.seconds)
         print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
         done(result)
 
     with torch.inference_mode():
         for name in options.ours:
+            context = new_context()
             if name in STREAMED:
                 inpainter, part = streamed(name)
-                add(name, inpainter, State(), part)
+                add(name, inpainter, State(), part, context)
             else:
-                add(name, *ours(name, views, context, options.device, options.precision))
+                inpainter, state = ours(name, views, context, options.device, options.precision)
+                add(name, inpainter, state, views[NOW], context)
         for network, framing in dict.fromkeys((RIVAL, *wanted)):
-            add(f"{network}-o-{framing}", *baseline(network, framing, views, context, options))
+            context = new_context()
+            inpainter, state = baseline(network, framing, views, context, options)
+            add(f"{network}-o-{framing}", inpainter, state, views[NOW], context)
     result["fps_of_ours_over"] = ratios(figures)
     done(result)
     return result

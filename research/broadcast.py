@@ -1,4 +1,4 @@
-"""The cost of broadcast watchers: PYTHONPATH=benchmarks python research/broadcast.py [--watchers 1 50 200] [--write].
+"""The cost of broadcast watchers: python research/broadcast.py [--watchers 1 50 200] [--write].
 
 A server broadcasts a studio scene while a viewer on air moves around. Watchers in another process do what the page's
 player does: they request the playlist twice a second and every segment once. Prints what they received, how late, and
@@ -15,6 +15,7 @@ import threading
 import time
 from urllib.parse import urlsplit
 
+import benchmarks_path  # noqa: F401
 from live import served
 from measure import write
 

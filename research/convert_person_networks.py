@@ -6,7 +6,7 @@ Needs tensorflow, tf2onnx and onnx in an environment of their own, and the wheel
     python research/convert_person_networks.py mediapipe-0.10.21-*.whl OUT
 """
 
-import sys
+import argparse
 import tempfile
 import zipfile
 from pathlib import Path
@@ -14,11 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import onnx
-import tensorflow as tf
 from onnx import TensorProto, helper, numpy_helper
-from tensorflow.python.framework import tensor_util
-from tf2onnx import convert, tflite_utils
-from tf2onnx.handler import tfl_op
 
 MODELS = {
     "detector": "mediapipe/modules/pose_detection/pose_detection.tflite",
@@ -28,6 +24,8 @@ MODELS = {
 
 def dense_weights(model: Path) -> dict[str, np.ndarray]:
     """The outputs of all DENSIFY operations by the name of their sparse input; tf2onnx does not know these."""
+    import tensorflow as tf
+
     resolver = tf.lite.experimental.OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES
     run = tf.lite.Interpreter(
         str(model), experimental_preserve_all_tensors=True, experimental_op_resolver_type=resolver
@@ -43,6 +41,8 @@ def dense_weights(model: Path) -> dict[str, np.ndarray]:
 
 def with_dense_constants(parse, dense: dict[str, np.ndarray]):
     """`tflite_utils.parse_tflite_graph` with the sparse constants replaced by dense ones."""
+    from tensorflow.python.framework import tensor_util
+    from tf2onnx import tflite_utils
 
     def decode(proto):
         try:
@@ -84,16 +84,24 @@ def in_half_precision(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def main(wheel: str, out: str) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("wheel", type=Path, help="the wheel of mediapipe")
+    parser.add_argument("out", type=Path, help="an existing folder")
+    options = parser.parse_args()
+
+    from tf2onnx import convert, tflite_utils
+    from tf2onnx.handler import tfl_op
+
     tfl_op("TFL_DENSIFY", onnx_op="Identity")(type("Densify", (), {}))
     parse = tflite_utils.parse_tflite_graph
-    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(wheel) as package:
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(options.wheel) as package:
         for name, path in MODELS.items():
             model = Path(package.extract(path, folder))
             tflite_utils.parse_tflite_graph = with_dense_constants(parse, dense_weights(model))
             converted, _ = convert.from_tflite(str(model), opset=17)
-            onnx.save(in_half_precision(converted), Path(out) / f"{name}.onnx")
+            onnx.save(in_half_precision(converted), options.out / f"{name}.onnx")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,7 +1,7 @@
 """How one mistake in a good capture is handled: refused, named in a warning, harmless, or silent.
 
-    PYTHONPATH=benchmarks python research/corruptions.py CAPTURE [--count N] [--first N] [--write]
-    PYTHONPATH=benchmarks python research/corruptions.py studio [--count N] [--first N] [--write]
+    python research/corruptions.py CAPTURE [--count N] [--first N] [--write]
+    python research/corruptions.py studio [--count N] [--first N] [--write]
 
 Corruption number n follows from seed n. Each corrupted capture is opened and prepared as in `viewmend mend`. The view
 of the camera nearest to the corrupted one is rendered from the others and compared with that of the good capture.
@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 import cv2
 from corruptions_lib import corrupt, middle
 from measure import write

@@ -1,4 +1,4 @@
-"""Glass to glass of a live rig: PYTHONPATH=benchmarks python research/glass_to_glass.py [--cameras 8] [--size 320].
+"""Glass to glass of a live rig: python research/glass_to_glass.py [--cameras 8] [--size 320].
 
 A process pushes frames of the studio to `viewmend serve live` in real time. The subject of each has one colour of 27,
 which tells the frame in the page of a headless Chromium (software WebGL): the centre of the canvas is read back right
@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 
+import benchmarks_path  # noqa: F401
 import torch
 from measure import summarise
 from playwright.sync_api import sync_playwright

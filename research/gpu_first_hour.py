@@ -1,4 +1,4 @@
-"""Everything only a GPU can answer: PYTHONPATH=benchmarks python research/gpu_first_hour.py [--out DIR].
+"""Everything only a GPU can answer: python research/gpu_first_hour.py [--out DIR].
 
 In ten minutes and in this order, each step in a process of its own so that a failure or hang costs nothing else:
 
@@ -25,6 +25,7 @@ import threading
 import time
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 import torch
 from measure import machine, synchronise
 

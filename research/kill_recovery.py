@@ -1,4 +1,4 @@
-"""Kill every command that writes: PYTHONPATH=benchmarks python research/kill_recovery.py [--commands mend ...].
+"""Kill every command that writes: python research/kill_recovery.py [--commands mend ...].
 
 Each command runs once completely, and the files that it opens for writing, renames, creates and removes are counted.
 Then it is killed (SIGKILL) at some of these points, each time just after a file was opened, and run again. A kill may
@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 from measure import write
 
 # Imported once; every run is a fork of this process.

@@ -4,6 +4,7 @@ Every image carries its frame number in its upper rows, in levels too close toge
 can tell when it was taken. `python research/live_senders.py KIND VIDEO PORT EPOCH PHASE PPM` runs one camera.
 """
 
+import argparse
 import io
 import signal
 import socketserver
@@ -177,8 +178,16 @@ class _Pipe(io.RawIOBase):
 
 
 def main() -> None:
-    kind, path, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    epoch_s, phase_s, ppm = map(float, sys.argv[4:7])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=("udp", "rtsp", "http", "mjpeg"), help="how the video is sent")
+    parser.add_argument("video", help="the camera's file")
+    parser.add_argument("port", type=int, help="port on this machine")
+    parser.add_argument("epoch", type=float, help="when the first image is sent: seconds of the monotonic clock")
+    parser.add_argument("phase", type=float, help="seconds by which this camera is late")
+    parser.add_argument("ppm", type=float, help="parts per million by which this camera's clock is fast")
+    options = parser.parse_args()
+    kind, path, port = options.kind, options.video, options.port
+    epoch_s, phase_s, ppm = options.epoch, options.phase, options.ppm
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if kind in ("http", "mjpeg"):
         serve_http(kind, path, port, epoch_s, phase_s, ppm)

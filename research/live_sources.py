@@ -1,4 +1,4 @@
-"""Eight simulated live cameras: PYTHONPATH=benchmarks python research/live_sources.py [--fps 15 7.5] [--write].
+"""Eight simulated live cameras: python research/live_sources.py [--fps 15 7.5] [--write].
 
 Each camera is a process (live_senders.py) that sends a studio video in real time: MPEG-TS over UDP and HTTP, JPEG over
 HTTP, RTSP. Cameras are up to a fifth of a frame apart, and their clocks have arbitrary starts and are off by up to 100
@@ -22,6 +22,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 import cv2
 from live_senders import FPS, FRAMES, SIZE_PX, make, number_of
 from measure import summarise, write

@@ -1,4 +1,4 @@
-"""Many viewers on two replicas: PYTHONPATH=benchmarks python research/many_viewers.py [--kills 20] [--frames 10000].
+"""Many viewers on two replicas: python research/many_viewers.py [--kills 20] [--frames 10000].
 
 Runs `viewmend serve --ray local` with two replicas. First four viewers move around while the replica that serves them
 is killed repeatedly; measures how long each waits for its next image and whether it answers its own pose. Then four
@@ -22,6 +22,7 @@ import time
 import urllib.request
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 from measure import write
 
 from viewmend.live.client import Client

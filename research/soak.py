@@ -1,4 +1,4 @@
-"""Soak test of the live server: PYTHONPATH=benchmarks python research/soak.py --minutes 30 [--write].
+"""Soak test of the live server: python research/soak.py --minutes 30 [--write].
 
 `viewmend serve live` in another process; a rig that pushes studio frames and is killed now and then; viewers that come
 and go and check that every frame answers their own request and pose; a client that sends malformed messages;
@@ -25,6 +25,7 @@ import urllib.request
 from collections import Counter
 from pathlib import Path
 
+import benchmarks_path  # noqa: F401
 from measure import write
 from unauthenticated_load import KINDS, begin
 from websockets.exceptions import ConnectionClosed
