@@ -17,11 +17,11 @@ from measure import timed, write
 from reference.random_views import holed, images, mended, random_view
 
 from viewmend import Stream, StreamConfig, load_inpainter
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.export.traceable import ViewInputs, ViewOutputs
 from viewmend.models.base import ContextProvider
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 
 TOLERANCE = 1e-3
 Runner = Callable[[ViewInputs], Sequence[torch.Tensor]]

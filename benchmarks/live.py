@@ -12,7 +12,6 @@ import time
 
 from measure import summarise, write
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.client import Client
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.listener import Server
@@ -20,6 +19,7 @@ from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
 from viewmend.models.checkpoint import load_inpainter
+from viewmend.studio.stage import Studio, StudioConfig
 
 SEED, CAMERAS, FRAMES, FPS = 10008, 8, 30, 15.0
 SIZES = ((320, 320), (512, 612))

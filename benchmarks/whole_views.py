@@ -23,20 +23,20 @@ from measure import write
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.data.holdout.capture_scenes import capture_set
-from viewmend.data.holdout.scenes import LeaveOneOutScene
-from viewmend.data.holdout.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.evaluation.scores import Scorers, TrueView, score_view, true_view
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import rasterize
+from viewmend.geometry.rim import rim_depth
 from viewmend.metrics.lpips import Lpips, load_lpips
 from viewmend.models.base import RenderQuality
 from viewmend.models.compositing import composite
 from viewmend.models.registry import make_method
-from viewmend.models.views.grid import rim_depth
 from viewmend.rendering.view import RenderConfig, render_depth
+from viewmend.scenes.capture_scenes import capture_set
+from viewmend.scenes.held_out import LeaveOneOutScene
+from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
 from viewmend.training.views import CORRECT

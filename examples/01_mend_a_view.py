@@ -9,7 +9,7 @@ import torch
 from viewmend import Stream, load_inpainter, open_capture, prepare
 from viewmend.data.images import write_image
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.studio.stage import Studio, StudioConfig
 
 
 def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:

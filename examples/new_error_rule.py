@@ -3,8 +3,8 @@
 import torch
 
 from viewmend import Evidence, RenderConfig, Stream, StreamConfig, error_rule, make_method
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 
 THRESHOLD = 0.05
 """Spread of the source cameras' colours, in [0, 1], above which a pixel counts as wrong."""

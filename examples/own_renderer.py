@@ -14,12 +14,12 @@ import torch
 
 from viewmend import Stream
 from viewmend.data.images import write_image
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.models.base import Inpainter
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.rendering.view import select_closest
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame, Silhouettes
 
 

@@ -32,8 +32,6 @@ from torch import Tensor
 from viewmend.contrib.baselines.framing import DILATION_PX, Canvas, Window, window_canvas, windows_over
 from viewmend.contrib.baselines.online import Clip, OnlineConfig, OnlineInpainter, OnlineNetwork, OnlineState, Sampling
 from viewmend.contrib.baselines.published import NETWORKS
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
 from viewmend.models.checkpoint import build
 from viewmend.models.classical import Unfilled
@@ -43,6 +41,8 @@ from viewmend.models.paper.context import window_times
 from viewmend.rendering.crop import subject_crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import ContextViews, IncompleteView
 
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13

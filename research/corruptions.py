@@ -26,9 +26,9 @@ from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSubset
-from viewmend.data.synthetic.stage import Studio, StudioConfig
-from viewmend.evaluation.mending import Mender
+from viewmend.mending import Mender
 from viewmend.models.classical import Telea
+from viewmend.studio.stage import Studio, StudioConfig
 
 LEAST_LOSS_DB = 0.5
 

@@ -25,8 +25,8 @@ import torch
 from measure import summarise
 from playwright.sync_api import sync_playwright
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.client import Publisher
+from viewmend.studio.stage import Studio, StudioConfig
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 LEVELS = (40, 140, 240)

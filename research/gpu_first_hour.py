@@ -30,11 +30,11 @@ import torch
 from measure import machine, synchronise
 
 from viewmend import Stream
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.evaluation.paper_tables import training_of
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.stream import StreamConfig
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.utils.atomic_writes import write_text
 
 HERE = Path(__file__).parent

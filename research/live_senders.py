@@ -22,8 +22,8 @@ import numpy as np
 from viewmend.data.images import write_image
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureSubset
-from viewmend.data.synthetic.performer import srgb_from_linear
-from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.utils.srgb import srgb_from_linear
 
 SIZE_PX, FPS, FRAMES, KEY_EVERY = (512, 612), 15, 30, 15
 BLOCK_PX, BITS, LEVELS = 16, 6, 5

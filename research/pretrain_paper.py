@@ -22,13 +22,14 @@ from viewmend.models.paper.config import PaperConfig, paper, paper_small
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.paper.patches import PATCH_CELLS, PATCH_PX, STEP_CELLS, STEP_PX, split
 from viewmend.models.paper.tokenizer import build_context_input
-from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.loop import train
 from viewmend.training.objective import MIN_SQUARE, ImageLoss, Objective, StepOutput, load_start
 from viewmend.training.paper import SAMPLING
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import sample_scenes
 from viewmend.types import ContextViews
+from viewmend.utils.options import HIDDEN
 
 STEPS_A_SIDE = 6
 CROP_PX = STEPS_A_SIDE * STEP_PX + PATCH_PX

@@ -31,9 +31,9 @@ from unauthenticated_load import KINDS, begin
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.client import Client, Publisher
 from viewmend.live.protocol import token_query
+from viewmend.studio.stage import Studio, StudioConfig
 
 TOKEN = "a token for the benchmark"
 SIZE, CAMERAS, FRAMES = 160, 6, 24

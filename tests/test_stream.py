@@ -11,7 +11,6 @@ import torch
 from reference.ball import camera_at, photograph, proxy, ring
 from reference.forged import forged
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.frame_cache import WINDOW, cache_frame
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
@@ -24,6 +23,7 @@ from viewmend.models.paper.context import window_times
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.cancellation import CancelledError, cancellable
 

@@ -10,9 +10,9 @@ from reference.ball import camera_at, photograph, ring
 from reference.forged import forged
 from torch.nn import functional as F
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.classical import Telea
 from viewmend.stream import Stream
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import IncompleteView, Silhouettes
 
 

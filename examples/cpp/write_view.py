@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 from viewmend import Stream, StreamConfig, load_inpainter
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.export.traceable import ViewInputs
 from viewmend.models.base import ContextProvider
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.utils.atomic_writes import write_tensors
 
 

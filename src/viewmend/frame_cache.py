@@ -59,7 +59,7 @@ class CachedFrame:
 
     Examples:
         >>> from viewmend import Stream, make_method
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> Stream(make_method("telea")).add_frame(frame).depth(frame.cameras.names[:1]).shape
         torch.Size([1, 64, 64])

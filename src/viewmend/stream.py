@@ -67,8 +67,8 @@ class StreamView:
 
     Examples:
         >>> from viewmend import Stream, make_method
-        >>> from viewmend.data.synthetic.rigs import orbit
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.rigs import orbit
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> target = orbit([0.4], (64, 64), elevation_rad=0.2)
         >>> stream = Stream(make_method("telea"))
@@ -89,8 +89,8 @@ class Stream:
 
     Examples:
         >>> from viewmend import Stream, make_method
-        >>> from viewmend.data.synthetic.rigs import orbit
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.rigs import orbit
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> target = orbit([0.4], (64, 64), elevation_rad=0.2)
         >>> stream = Stream(make_method("telea"))

@@ -24,8 +24,6 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.utils.tensors import OnDevice, check_tensor, extremes
 
-RIM_PX = 2
-"""The subject may extend this many pixels beyond the proxy, because masks and voxel grids cut it off."""
 FAINT = 1 / 16
 """A pixel's colour divided by its opacity is noise if the opacity is below this."""
 NEAR_PX = 4
@@ -85,7 +83,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
     `cameras.size_px` has the size of each. A camera without an image in this frame is absent.
 
     Examples:
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> frame.rgb.shape, frame.time, len(frame.without(frame.cameras.names[:1]).cameras)
         (torch.Size([4, 3, 64, 64]), 0, 3)
@@ -158,7 +156,7 @@ class ContextViews(_LazyStacks, OnDevice):
 
     Examples:
         >>> from viewmend import Stream, make_method
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> Stream(make_method("telea")).add_frame(frame).context(frame.cameras.names[:2]).depth.shape
         torch.Size([2, 64, 64])

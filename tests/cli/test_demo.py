@@ -7,7 +7,7 @@ import torch
 
 from viewmend.cli import main
 from viewmend.data.native_capture import open_capture
-from viewmend.evaluation.mending import Mender
+from viewmend.mending import Mender
 from viewmend.utils.contact_sheet import GAP_PX, LABEL_PX
 
 SMALL = ["--frames", "3", "--size", "72", "--cameras", "4", "--model", "telea", "--seed", "10001"]

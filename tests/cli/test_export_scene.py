@@ -18,9 +18,9 @@ from viewmend.cli import main
 from viewmend.data.native_writer import write_capture
 from viewmend.export.scene import extract_points
 from viewmend.geometry.cameras import concatenate_cameras, project
+from viewmend.geometry.rim import RIM_PX
 from viewmend.models.registry import make_method
 from viewmend.stream import Stream
-from viewmend.types import RIM_PX
 
 
 def rig():

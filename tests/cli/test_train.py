@@ -16,10 +16,10 @@ from training.conftest import MODEL, VIEWS_MODEL
 
 from viewmend.cli import main
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.checkpoint import load_config, save_inpainter
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.recipes import RECIPES
 
 BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")

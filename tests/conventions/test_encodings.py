@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2] / "src/viewmend"
-EXCEPTIONS = {"data/synthetic/bvh.py", "data/synthetic/procedural/skeleton.py"}
+EXCEPTIONS = {"studio/bvh.py", "studio/procedural/skeleton.py"}
 """These read ASCII."""
 
 

@@ -20,7 +20,7 @@ from viewmend.data.checks.synchronisation import check_image_mask_sync, describe
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
-from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import MultiViewFrame
 
 

@@ -11,7 +11,7 @@ from viewmend.data.colour_matching import MIN_CAMERAS, SurfaceColours, SurfacePo
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.data.source import CaptureWrapper
-from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.studio.stage import Studio, StudioConfig
 
 CAMERAS = 8
 PRECISION, WORST = 0.012, 0.04

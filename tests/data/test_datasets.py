@@ -28,8 +28,8 @@ from reference.random_rigs import (
 from viewmend.data.containers import names_in, read_bytes
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.holdout.capture_scenes import capture_set
 from viewmend.data.native_capture import open_capture
+from viewmend.scenes.capture_scenes import capture_set
 
 META = """{ // comments are allowed
  "type": "VCI", "version": "2.1.0",

@@ -30,9 +30,9 @@ from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.formats.files import Footage, match_names
 from viewmend.data.formats.opencv import MAX_BYTES, read_storage
-from viewmend.data.holdout.capture_scenes import capture_set
 from viewmend.data.native_capture import open_capture
 from viewmend.data.videos import video_properties
+from viewmend.scenes.capture_scenes import capture_set
 
 # Round trips. A writer takes the folder and the rig, in OpenCV's convention if the format has it.
 

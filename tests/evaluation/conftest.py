@@ -4,11 +4,11 @@ from dataclasses import fields
 
 import pytest
 
-from viewmend.data.holdout.studio_scenes import StudioScene
-from viewmend.data.synthetic.stage import StudioConfig
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import Cell, CellKey
 from viewmend.evaluation.scores import ViewScores
+from viewmend.scenes.studio_scenes import StudioScene
+from viewmend.studio.stage import StudioConfig
 
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)
 

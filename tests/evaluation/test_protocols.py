@@ -7,9 +7,8 @@ import torch
 from models.plates import Rig, context, view
 from reference.ball import BallCapture, camera_at, ring
 
-from viewmend.data.holdout.scenes import LeaveOneOut, revealed
-from viewmend.evaluation.mending import Mender
 from viewmend.geometry.hull import HullConfig
+from viewmend.mending import Mender
 from viewmend.models.checkpoint import build, load_inpainter
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import opaque_in_mask
@@ -17,6 +16,7 @@ from viewmend.models.paper.config import paper, paper_small
 from viewmend.models.paper.tokenizer import build_context_input, build_target_input
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig, select_closest
+from viewmend.scenes.held_out import LeaveOneOut, revealed
 from viewmend.stream import Stream
 from viewmend.training.config import SamplingConfig
 from viewmend.training.samples import HeldOutCamera

@@ -8,8 +8,6 @@ import pytest
 import torch
 
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter
-from viewmend.data.holdout.scenes import LeaveOneOutScene
-from viewmend.data.holdout.studio_scenes import lengthened, procedural_set, turning_set
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
 from viewmend.models.base import ContextProvider, State
@@ -18,6 +16,8 @@ from viewmend.models.classical import Telea
 from viewmend.models.compositing import composite
 from viewmend.models.paper.config import paper_small
 from viewmend.models.paper.context import window_times
+from viewmend.scenes.held_out import LeaveOneOutScene
+from viewmend.scenes.studio_scenes import lengthened, procedural_set, turning_set
 from viewmend.stream import Stream
 
 

@@ -11,7 +11,6 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from data.synthetic.tiny_performer import write_character, write_motion
 from fuzz.inputs import fuzz, fuzz_file, mutated_bytes, mutated_json, mutated_words, to_json
 from models.plates import tiny
 from reference import foreign_studios
@@ -20,16 +19,17 @@ from reference.foreign_formats import write_colmap, write_easymocap, write_trans
 from reference.foreign_images import write_agisoft, write_middlebury
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import named, random_rig
+from studio.tiny_performer import write_character, write_motion
 
 from viewmend.data.camera_path import read_camera_path
 from viewmend.data.images import read_mask, read_rgb
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.bvh import read_bvh
-from viewmend.data.synthetic.gltf import load_character
 from viewmend.live.protocol import Limits, Look, parse, unpack
 from viewmend.live.push import RigMessage, read_message
 from viewmend.models.checkpoint import load_network, save_inpainter
+from viewmend.studio.bvh import read_bvh
+from viewmend.studio.gltf import load_character
 from viewmend.utils.output_folder import OutputFolder
 
 

@@ -13,9 +13,9 @@ from jaxtyping import UInt8
 from safetensors.torch import save
 from torch import Tensor
 
-from viewmend.data.holdout.scenes import LeaveOneOut
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.rendering.view import RenderConfig
+from viewmend.scenes.held_out import LeaveOneOut
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.config import SceneConfig
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import Scene

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.alignment import WORTH_MOVING, shared_offset
 from viewmend.geometry.hull import HullConfig
+from viewmend.studio.stage import Studio, StudioConfig
 
 HULL = HullConfig(resolution=96)
 

@@ -7,11 +7,11 @@ import torch
 from live.live_servers import CAMERAS, PIPELINE, Running, decode, get
 from reference.ball import BallCapture, camera_at
 
-from viewmend.evaluation.mending import Mender
 from viewmend.live.client import Client
 from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.protocol import unpack
 from viewmend.live.renderer import Renderer, RenderRequest
+from viewmend.mending import Mender
 from viewmend.models.base import RenderQuality
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.smooth_fill import SmoothFill

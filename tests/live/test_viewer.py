@@ -16,7 +16,6 @@ from websockets.sync.client import connect
 from viewmend import serve
 from viewmend.cli import main, view
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.connection import ViewerConnection
 from viewmend.live.frame_source import SourceStatus, Span
 from viewmend.live.protocol import Limits
@@ -24,6 +23,7 @@ from viewmend.live.registry import SessionRegistry
 from viewmend.live.service import RenderService
 from viewmend.live.viewer import Viewer
 from viewmend.models.smooth_fill import SmoothFill
+from viewmend.studio.stage import Studio, StudioConfig
 
 TOKEN = "a token of a test, long enough"
 

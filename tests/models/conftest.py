@@ -2,12 +2,12 @@
 
 import pytest
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.pyramids import SourceCameras
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.stage import Studio, StudioConfig
 
 
 @pytest.fixture(scope="session")

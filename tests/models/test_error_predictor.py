@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
 from viewmend.models.checkpoint import load_network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views import error_predictor
-from viewmend.models.views.grid import rim_depth
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.rendering.crop import Crop
 from viewmend.rendering.error_mask import attenuate_background, select_by_gain

@@ -17,7 +17,6 @@ from viewmend.models.views.grid import (
     detail_bands,
     downsample2x,
     index_image,
-    rim_depth,
     run_tiled,
     scatter_to_image,
     upsample2x,
@@ -25,19 +24,6 @@ from viewmend.models.views.grid import (
 from viewmend.models.views.prediction import DepthDistribution
 
 SHAPES = [(70, 53), (64, 96), (33, 161), (17, 9)]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shape", [(1, 1), (3, 40), (17, 12)])
-def test_the_rim_has_the_smallest_depth_within_two_pixels(shape, dtype):
-    rng = torch.Generator().manual_seed(sum(shape))
-    depth = torch.where(torch.rand(shape, generator=rng) < 0.1, 1 + torch.rand(shape, generator=rng), 0.0).to(dtype)
-    found = rim_depth(depth)
-    for row in range(shape[0]):
-        for column in range(shape[1]):
-            near = depth[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3]
-            least = min((z for z in near.flatten().tolist() if z > 0), default=0.0)
-            assert found[row, column] == (depth[row, column] if depth[row, column] > 0 else least)
 
 
 @pytest.mark.parametrize("grad", [False, True])

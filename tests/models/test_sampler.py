@@ -7,7 +7,6 @@ import torch
 from models.plates import context, view
 from reference.rays_reference import sample_fill_reference
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
 from viewmend.models.views.aggregation import SampleAggregator
 from viewmend.models.views.config import AROUND, FAR, FEATURES, IN_VIEW, NEAR, OFFSETS, STATISTICS
@@ -32,6 +31,7 @@ from viewmend.models.views.sampler import (
     sample_rays,
     sample_rays_torch,
 )
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import Silhouettes
 
 

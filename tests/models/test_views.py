@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider, RenderQuality, State
 from viewmend.models.views import prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
-from viewmend.models.views.grid import rim_depth, scatter_to_image
+from viewmend.models.views.grid import scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.prediction import remains_of_phantoms
 from viewmend.models.views.pyramids import SceneScale, SourceCameras

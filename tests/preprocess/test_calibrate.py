@@ -16,13 +16,13 @@ from viewmend.data.native_capture import open_capture, pinhole_cameras
 from viewmend.data.native_format import read_calibration
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureSubset
-from viewmend.data.synthetic.rigs import ring_rig
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import project
 from viewmend.preprocess.calibration import silhouettes as held_out
 from viewmend.preprocess.calibration.board import Corners, parse_board
 from viewmend.preprocess.calibration.bundle import calibrate
 from viewmend.preprocess.calibration.silhouettes import HOLDS, HeldOutIou, Refinement, best_hold, brought_to, missed_px
+from viewmend.studio.rigs import ring_rig
+from viewmend.studio.stage import Studio, StudioConfig
 
 BOARD, SMALL_BOARD, DICTIONARY = "8x6:0.12:0.09", "6x5:0.16:0.12", "DICT_5X5_1000"
 TIMES = 14

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from viewmend.data.source import CaptureSubset
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.preprocess.masks import person
 from viewmend.preprocess.masks.masked import MaskedCapture, view_rgb
 from viewmend.preprocess.masks.person import PersonMasks, Roi
+from viewmend.studio.stage import Studio, StudioConfig
 
 ALONE = StudioConfig(cameras=4, frames=3, size_px=256, background="stage", seed=5)
 """One person and no furniture."""

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import torch
 
-from viewmend.data.synthetic.rigs import orbit
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.base import ContextProvider, State
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 
 

@@ -3,10 +3,10 @@
 import torch
 from einops import reduce
 
-from viewmend.data.synthetic.performer import srgb_from_linear
-from viewmend.data.synthetic.render import GLOSS_DOUBLINGS, SHADOW_BIAS_M
 from viewmend.geometry.cameras import project
 from viewmend.geometry.rasterize import Raster, interpolate
+from viewmend.studio.render import GLOSS_DOUBLINGS, SHADOW_BIAS_M
+from viewmend.utils.srgb import srgb_from_linear
 
 
 def unshadowed(pixels, z, depth):

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.models.base import Inpainter, RenderQuality
@@ -12,6 +11,7 @@ from viewmend.rendering import crop
 from viewmend.rendering.crop import Crop, mesh_crop, subject_crop
 from viewmend.rendering.view import render_view
 from viewmend.stream import Stream
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import CompletedView
 
 

@@ -8,12 +8,12 @@ from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 from training.other_device import other_device
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.holdout.capture_scenes import make_splits, read_splits, splits_json
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.metrics.lpips import load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.scenes.capture_scenes import make_splits, read_splits, splits_json
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training import held_back
 from viewmend.training.config import TrainConfig
 from viewmend.training.held_back import AUTO, HeldBack, HeldBackValidation, compare, held_back_views

@@ -10,18 +10,18 @@ import pytest
 import torch
 from training.conftest import SAMPLING, SCENES, studio_samples
 
-from viewmend.data.holdout.capture_scenes import make_splits, read_splits, splits_json
-from viewmend.data.holdout.scenes import LeaveOneOut
-from viewmend.data.holdout.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.data.source import limit_size
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.evaluation.scores import true_view
 from viewmend.geometry.hull import HullConfig
 from viewmend.models.classical import Unfilled
 from viewmend.rendering.view import RenderConfig
+from viewmend.scenes.capture_scenes import make_splits, read_splits, splits_json
+from viewmend.scenes.held_out import LeaveOneOut
+from viewmend.scenes.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.stream import Stream
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.samples import HeldOutCamera, Sample, rig_samples
 from viewmend.training.scenes import (

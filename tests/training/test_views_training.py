@@ -10,15 +10,16 @@ import torch
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
 from training.other_device import DEVICE, other_device
 
-from viewmend.data.holdout.scenes import LeaveOneOut
 from viewmend.data.native_writer import write_capture
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.rim import rim_depth
 from viewmend.models.checkpoint import load_network, save_inpainter
 from viewmend.models.smooth_fill import fill
-from viewmend.models.views.grid import nearest_depth, rim_depth
+from viewmend.models.views.grid import nearest_depth
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.scenes.held_out import LeaveOneOut
 from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.config import TrainConfig
 from viewmend.training.depth_geometry import DepthErrors
 from viewmend.training.loop import train

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from viewmend.cli.console import say
-from viewmend.training.config import NEGATED
+from viewmend.utils.options import NEGATED
 
 if TYPE_CHECKING:
     from viewmend.data.prepare import PreparedCapture

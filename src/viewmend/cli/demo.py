@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from viewmend.cli.checks import ViewOptions, check_least
-from viewmend.training.config import FLAT
+from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
-    from viewmend.evaluation.mending import MendStep
     from viewmend.geometry.cameras import Cameras
+    from viewmend.mending import MendStep
 
 FPS = 15.0
 SWEEP_RAD = 1.6
@@ -54,10 +54,10 @@ def run(options: Options) -> int:
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import in_words
     from viewmend.data.source import prefetch
-    from viewmend.data.synthetic.stage import Studio, StudioConfig
-    from viewmend.evaluation.mending import Mender, MendSummary
+    from viewmend.mending import Mender, MendSummary
     from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig
+    from viewmend.studio.stage import Studio, StudioConfig
     from viewmend.utils.output_folder import OutputFolder
 
     render = options.view.config()
@@ -90,7 +90,7 @@ def run(options: Options) -> int:
 
 def _path(options: Options) -> "Cameras":
     """The moving camera: around the subject and back, a little above the ring."""
-    from viewmend.data.synthetic.rigs import orbit
+    from viewmend.studio.rigs import orbit
 
     phases = [n / max(1, options.frames) for n in range(options.frames)]
     azimuths = [SWEEP_RAD * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_device, check_least
-from viewmend.training.config import FLAT
+from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from viewmend.data.holdout.scenes import LeaveOneOutScene
-    from viewmend.data.holdout.studio_scenes import StudioScene
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.result_cache import CellStore
+    from viewmend.scenes.held_out import LeaveOneOutScene
+    from viewmend.scenes.studio_scenes import StudioScene
 
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3")), "sheets/*.png")
 """Files in OUT besides cells."""
@@ -206,8 +206,8 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
     Raises:
         ValueError: the options do not fit the set.
     """
-    from viewmend.data.holdout import studio_scenes as studio
-    from viewmend.data.holdout.capture_scenes import capture_set, is_splits, split_scenes
+    from viewmend.scenes import studio_scenes as studio
+    from viewmend.scenes.capture_scenes import capture_set, is_splits, split_scenes
 
     part = slice(None, options.scenes and options.every * options.scenes, options.every)
     if name in LONG_SETS and options.frames not in (None, studio.LONG_FRAMES):

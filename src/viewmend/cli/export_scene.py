@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from viewmend.cli.checks import Precision, PreparationOptions, check_least
-from viewmend.training.config import FLAT
+from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
     from torch import Tensor

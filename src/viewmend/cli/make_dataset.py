@@ -7,7 +7,8 @@ from typing import Annotated, TypeVar
 
 from viewmend.cli.checks import check_least
 from viewmend.cli.train import check_scenes, split_recipe
-from viewmend.training.config import FLAT, HIDDEN, ObjectiveConfig, SceneConfig
+from viewmend.training.config import ObjectiveConfig, SceneConfig
+from viewmend.utils.options import FLAT, HIDDEN
 
 PLAN = "plan.txt"
 """File with everything that determines the samples of a folder."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
-from viewmend.training.config import FLAT
+from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
     from viewmend.data.camera_path import Turntable
@@ -86,7 +86,7 @@ def run(options: Options) -> int:
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
     from viewmend.data.prepare import prepare
     from viewmend.data.source import prefetch
-    from viewmend.evaluation.mending import Mender, MendSummary
+    from viewmend.mending import Mender, MendSummary
     from viewmend.models.base import RenderQuality
     from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig

@@ -12,9 +12,9 @@ from torch import Tensor
 from viewmend.cli.console import in_db
 from viewmend.data.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
 from viewmend.data.videos import write_mp4, write_webm
-from viewmend.evaluation.mending import MendStep, MendSummary
-from viewmend.export.scene import cutout
 from viewmend.geometry.hull import FOREGROUND
+from viewmend.mending import MendStep, MendSummary
+from viewmend.models.compositing import cutout
 from viewmend.types import CompletedView
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.output_folder import OutputFolder

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import tyro
 
 from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
-from viewmend.training.config import FLAT
+from viewmend.utils.options import FLAT
 from viewmend.utils.plugins import import_object
 
 if TYPE_CHECKING:
@@ -229,9 +229,9 @@ def open_source(options: Options) -> "FrameSource":
 
 def _make_studio(options: Options) -> "CaptureSource":
     """The synthetic scene; made on the thread that reads its frames, so that the page is available at once."""
-    from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS
     from viewmend.data.prepare import prepare
-    from viewmend.data.synthetic.stage import Studio, StudioConfig
+    from viewmend.scenes.held_out import PROCEDURAL_SEEDS
+    from viewmend.studio.stage import Studio, StudioConfig
 
     seed = PROCEDURAL_SEEDS["test"][1] if options.seed is None else options.seed
     config = StudioConfig(seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0)

@@ -38,7 +38,7 @@ def run(options: Options) -> int:
 
     from viewmend.cli.checks import check_least
     from viewmend.cli.console import say, show
-    from viewmend.data.holdout.capture_scenes import make_splits, splits_json
+    from viewmend.scenes.capture_scenes import make_splits, splits_json
     from viewmend.utils.atomic_writes import remove_partial_file, write_text
 
     try:

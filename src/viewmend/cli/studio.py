@@ -47,8 +47,8 @@ def run(options: Options) -> int:
     from viewmend.cli.console import print_json, say, track
     from viewmend.data.errors import CaptureError
     from viewmend.data.native_writer import remove_unfinished, write_capture
-    from viewmend.data.synthetic.imperfections import Imperfections
-    from viewmend.data.synthetic.stage import Studio, StudioConfig
+    from viewmend.studio.imperfections import Imperfections
+    from viewmend.studio.stage import Studio, StudioConfig
 
     seeds = range(options.seed, options.seed + options.scenes)
     folders = [options.out / f"scene_{seed:05d}" for seed in seeds]

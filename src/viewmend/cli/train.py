@@ -6,7 +6,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from viewmend.training.config import FLAT, SceneConfig, TrainConfig
+from viewmend.training.config import SceneConfig, TrainConfig
+from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
     from viewmend.training.run_files import Progress

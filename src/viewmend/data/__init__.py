@@ -1,1 +1,1 @@
-"""Captures on disk, the readers, held-out scenes, and the synthetic studio."""
+"""Captures on disk: their formats, the checks before use, colour matching, images and videos."""

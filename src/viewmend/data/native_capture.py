@@ -72,7 +72,7 @@ def open_capture(
         >>> from pathlib import Path
         >>> from viewmend import open_capture
         >>> from viewmend.data.native_writer import write_capture
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> folder = Path(tempfile.mkdtemp()) / "take"
         >>> _ = write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
         >>> capture = open_capture(folder)

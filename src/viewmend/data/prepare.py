@@ -123,7 +123,7 @@ def prepare(
 
     Examples:
         >>> from viewmend import prepare
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> capture = prepare(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), max_image_size=32, align=False)
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 32, 32])

@@ -68,7 +68,7 @@ class MemoryCapture:
 
     Examples:
         >>> from viewmend.data.source import MemoryCapture
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> MemoryCapture("ours", frame.cameras, (frame,)).frame_ids
         ('0',)

@@ -8,13 +8,13 @@ from dataclasses import asdict, astuple, dataclass, fields
 from statistics import stdev
 
 from viewmend.evaluation.averages import Record, Records, Row, Table, frames_with_holes, records, speed, tables
-from viewmend.evaluation.mending import SLOW_MS
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import PROTOCOL, Cell
 from viewmend.evaluation.scene_run import RunSettings
 from viewmend.evaluation.scores import MIN_HOLE_PX
 from viewmend.models.registry import PRIVILEGED, REFERENCE, own_background
 from viewmend.utils.logging import printable
+from viewmend.view_sequence import SLOW_MS
 
 RULES = (
     "One camera is held out, image and mask. Its view is rendered from the other cameras and completed frame by frame, "

@@ -15,13 +15,13 @@ from zipfile import BadZipFile
 import numpy as np
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.holdout.scenes import LeaveOneOutScene
 from viewmend.data.images import read_rgb, write_image
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import RunSettings, SceneRun
 from viewmend.evaluation.scores import FEATURES, KINDS, Features, ViewScores
 from viewmend.models.registry import identity, make_method
 from viewmend.rendering.error_mask import error_rule
+from viewmend.scenes.held_out import LeaveOneOutScene
 from viewmend.utils.atomic_writes import write_atomically, write_text
 from viewmend.utils.contact_sheet import Picture
 from viewmend.utils.untrusted_input import typed

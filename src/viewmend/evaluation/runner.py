@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from viewmend.data.holdout.scenes import LeaveOneOutScene
 from viewmend.evaluation.provenance import provenance
 from viewmend.evaluation.result_cache import Cell, CellStore, cell_keys, method_identities, to_cells
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
 from viewmend.models.base import Inpainter
+from viewmend.scenes.held_out import LeaveOneOutScene
 from viewmend.utils.logging import log_to_terminal
 from viewmend.utils.plugins import import_object
 

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from viewmend.data.holdout.scenes import LeaveOneOutScene, Protocol, revealed
-from viewmend.evaluation.mending import Mender
 from viewmend.evaluation.scores import (
     Features,
     PreviousView,
@@ -25,10 +23,12 @@ from viewmend.models.base import Inpainter
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.models.registry import error_model_for, make_method
+from viewmend.scenes.held_out import LeaveOneOutScene, Protocol, revealed
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import Picture, picture
 from viewmend.utils.tensors import to_device
+from viewmend.view_sequence import ViewSequence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ class _MethodStream:
     def __init__(self, method: str, settings: RunSettings, scorers: Scorers, loaded: dict[str, Inpainter]) -> None:
         self.method, self._loaded = method, loaded
         self._settings, self._scorers = settings, scorers
-        self._mender: Mender | None = None
+        self._sequence: ViewSequence | None = None
         self._error: str | None = None
         self._previous: torch.Tensor | None = None
         self._scores: list[ViewScores] = []
@@ -160,18 +160,18 @@ class _MethodStream:
         if self._error is not None:
             return
         try:
-            mender = self._mender = self._mender or self._make(frame.bounds)
-            mender.add_frame(frame.cached)
+            sequence = self._sequence = self._sequence or self._make(frame.bounds)
+            sequence.add_frame(frame.cached)
             if frame.scored:
-                self._score(mender, frame)
+                self._score(sequence, frame)
             else:
-                mender.skip(frame.view.camera, frame.view.time, frame.view.target_mask)
-            if mender.state is not None:
-                mender.state = mender.stream.inpainter.reveal_truth(mender.state, frame.truth.rgb)
+                sequence.skip(frame.view.camera, frame.view.time, frame.view.target_mask)
+            if sequence.state is not None:
+                sequence.state = sequence.stream.inpainter.reveal_truth(sequence.state, frame.truth.rgb)
         except Exception as error:
             self._error = _message(error)
 
-    def _make(self, bounds: Bounds | None) -> Mender:
+    def _make(self, bounds: Bounds | None) -> ViewSequence:
         settings = self._settings
         if new := self.method not in self._loaded:
             self._loaded[self.method] = make_method(self.method, settings.device, settings.precision)
@@ -179,12 +179,12 @@ class _MethodStream:
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
         error_model = error_model_for(inpainter, settings.device) if predicted else None
         config = replace(settings.stream, background=settings.background)
-        mender = Mender(inpainter, config, bounds, error_model=error_model)
-        mender.first_twice = new
-        return mender
+        sequence = ViewSequence(inpainter, config, bounds, error_model=error_model)
+        sequence.first_twice = new
+        return sequence
 
-    def _score(self, mender: Mender, frame: _Frame) -> None:
-        made = mender.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)
+    def _score(self, sequence: ViewSequence, frame: _Frame) -> None:
+        made = sequence.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)
         completed, previous = made.completed, None
         _check(completed)
         rgb = composite(self._settings.background, completed.rgb, completed.opacity)

@@ -9,24 +9,25 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.data.images import write_image
-from viewmend.data.synthetic.performer import linear_from_srgb
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.orbit import horizontal_axes, upright
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.geometry.rim import RIM_PX
 from viewmend.geometry.sampling import in_view
 from viewmend.models.base import State
+from viewmend.models.compositing import cutout
 from viewmend.rendering.proxy_views import vertex_colours
 from viewmend.stream import Stream
-from viewmend.types import RIM_PX, CompletedView, MultiViewFrame
+from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.atomic_writes import write_atomically, write_text
-from viewmend.utils.contact_sheet import picture
+from viewmend.utils.srgb import linear_from_srgb
 
 SENSOR_MM = 36.0
 """Sensor width of every camera: engines need one, but only its ratio to the focal length matters."""
@@ -329,11 +330,6 @@ def export_scene(
     write_text(out / "cameras.usda", usd_scene(groups, rotation, fps or 1.0, count))
     write_text(out / "open_in_blender.py", blender_script(groups, rotation, fps or 1.0, count, images))
     return SceneCounts(count, len(views), vertices, points)
-
-
-def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:
-    """The subject as RGBA with straight alpha."""
-    return np.dstack([picture(completed.straight_rgb), picture(completed.opacity[None])[..., 0]])
 
 
 def extract_points(completed: CompletedView, frame: MultiViewFrame, min_confidence: float) -> Float[Tensor, "point 6"]:

@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider
 from viewmend.models.smooth_fill import from_near, spread
-from viewmend.models.views.grid import rim_depth, scatter_to_image
+from viewmend.models.views.grid import scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.pyramids import AREA_LEVEL, SMALLEST_PX, MipLevels, SceneScale, SourceCameras, choose_levels
 from viewmend.models.views.ray_fill import gather_ray_inputs

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
+from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.threads import light_operations
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import BLACK, EXTRA_MODES, MENDED_MODES, FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
-from viewmend.models.views.grid import rim_depth
 from viewmend.types import FAINT, CompletedView, IncompleteView
 
 Image = UInt8[np.ndarray, "height width 3"]

@@ -24,7 +24,7 @@ class Viewer:
 
     Examples:
         >>> from viewmend import make_method, serve
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> with serve(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), make_method("telea")) as viewer:
         ...     type(viewer).__name__
         'Viewer'
@@ -139,7 +139,7 @@ def serve(
 
     Examples:
         >>> from viewmend import make_method, serve
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> studio = Studio(StudioConfig(cameras=4, frames=1, size_px=64))
         >>> with serve(studio, make_method("telea")) as viewer:
         ...     viewer.show(azimuth=30.0, mode="rendered")

@@ -71,7 +71,7 @@ class ContextProvider:
 
     Examples:
         >>> from viewmend import ContextProvider, Stream, make_method
-        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> from viewmend.studio.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
         >>> cached = Stream(make_method("telea")).add_frame(frame)
         >>> context = ContextProvider(lambda time, names: cached.context(names) if time == 0 else None)

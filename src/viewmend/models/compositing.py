@@ -6,12 +6,14 @@ Elsewhere in the package, images of a subject are on black, that is, multiplied 
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
+from viewmend.utils.contact_sheet import picture
 
 Background = Literal["black", "white"]
 Image = Float[Tensor, "3 height width"]
@@ -59,6 +61,11 @@ def cut(completed: CompletedView) -> CompletedView:
     alpha = completed.view.mask if completed.alpha is None else completed.alpha
     confidence, depth = (None if p is None else p * (mask > 0) for p in (completed.confidence, completed.depth))
     return replace(completed, rgb=completed.rgb * mask, alpha=alpha * mask, confidence=confidence, depth=depth)
+
+
+def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:
+    """The subject as an 8-bit RGBA image with straight alpha."""
+    return np.dstack([picture(completed.straight_rgb), picture(completed.opacity[None])[..., 0]])
 
 
 def to_background(background: Background, view: IncompleteView) -> IncompleteView:

@@ -14,9 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.geometry.rim import RIM_PX
 from viewmend.models.base import ContextProvider, ErrorMap, Inpainter
 from viewmend.rendering.blending import Blend
-from viewmend.types import RIM_PX, IncompleteView
+from viewmend.types import IncompleteView
 from viewmend.utils.plugins import load_from_file
 
 MIN_WEIGHT = 1e-5

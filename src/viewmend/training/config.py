@@ -9,15 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, T
 
 import tyro
 
+from viewmend.utils.options import FLAT, HIDDEN
+
 if TYPE_CHECKING:
     from torch import nn
 
-FLAT = tyro.conf.arg(name="")
-"""Marks a nested config whose fields are options without a prefix."""
-NEGATED = tyro.conf.arg(help_behavior_hint="")
-"""Marks a field that is true unless --no-NAME is given: its help describes that flag, not the field's default."""
-HIDDEN = tyro.conf.Suppress
-"""Marks a field that a recipe sets and the command line does not offer."""
 Item = TypeVar("Item", covariant=True)
 
 

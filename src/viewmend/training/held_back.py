@@ -9,8 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.holdout.capture_scenes import is_splits, training_captures
-from viewmend.data.holdout.scenes import LeaveOneOut
 from viewmend.data.images import write_image
 from viewmend.data.native_capture import NativeCapture
 from viewmend.data.prepare import open_masked, prepare
@@ -20,6 +18,8 @@ from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, Lpips, load_lpips
 from viewmend.models.base import Inpainter
 from viewmend.models.compositing import Background, camera_image, composite
+from viewmend.scenes.capture_scenes import is_splits, training_captures
+from viewmend.scenes.held_out import LeaveOneOut
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture

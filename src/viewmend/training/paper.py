@@ -12,10 +12,11 @@ from viewmend.models.paper.config import PaperConfig
 from viewmend.models.paper.config import paper as paper_model
 from viewmend.models.paper.patch_transformer import PatchTransformer, Prediction
 from viewmend.training.adversarial import GAN, Adversary, Discriminator, Judged
-from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, image_loss, load_start
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
+from viewmend.utils.options import HIDDEN
 
 WINDOW = (0, 10, 20, 27, 28, 29, 30)
 """The paper's temporal window of frame 30: t, t - 1, t - 2, t - 3, t - 10, t - 20 and t - 30."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from viewmend.models.views.config import RaysConfig
 from viewmend.models.views.pyramids import SourceCameras
 from viewmend.models.views.ray_fill import RayFill, RayInputs, gather_ray_inputs
-from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.objective import (
     MIN_SQUARE,
     HoleValidation,
@@ -29,6 +29,7 @@ from viewmend.training.objective import (
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import sample_scenes, validation_scenes
 from viewmend.training.shards import storable
+from viewmend.utils.options import HIDDEN
 
 PIXELS_PER_VIEW = 64
 """Hole pixels of a view whose rays are kept, at most."""

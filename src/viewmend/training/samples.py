@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from viewmend.data.holdout.scenes import LeaveOneOut, Protocol, revealed
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.hull import HullConfig
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.rendering.view import RenderConfig
+from viewmend.scenes.held_out import LeaveOneOut, Protocol, revealed
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig, SceneConfig
 from viewmend.types import ContextViews, IncompleteView

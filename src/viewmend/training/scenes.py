@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Protocol, runtime_checkable
 
-from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS, LeaveOneOut, Split, recordings
 from viewmend.data.prepare import PreparedCapture, prepare
 from viewmend.data.source import CaptureSource, limit_size
-from viewmend.data.synthetic.imperfections import Imperfections
-from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
+from viewmend.scenes.held_out import PROCEDURAL_SEEDS, LeaveOneOut, Split, recordings
+from viewmend.studio.imperfections import Imperfections
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.config import SamplingConfig, SceneConfig
 from viewmend.training.held_back import HeldBack, open_training_captures
 from viewmend.training.samples import Sample, rig_samples

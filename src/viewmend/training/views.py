@@ -18,26 +18,28 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.sampling import in_view
 from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.network import set_compute_dtype
 from viewmend.models.views.config import OFFSETS, ViewsConfig
-from viewmend.models.views.grid import CELL_PX, nearest_depth, rim_depth, scatter_to_image
+from viewmend.models.views.grid import CELL_PX, nearest_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.prediction import ViewPrediction
 from viewmend.models.views.pyramids import Pyramid, SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
 from viewmend.rendering.crop import Crop, subject_crop
 from viewmend.rendering.error_mask import attenuate_background
-from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.objective import MIN_SQUARE, ImageLoss, Objective, StepOutput, load_start, write_rows
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import rig_source, validation_scenes
 from viewmend.training.shards import storable
 from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSceneMaker
 from viewmend.types import IncompleteView
+from viewmend.utils.options import HIDDEN
 from viewmend.utils.tensors import to_device
 
 Image = Float[Tensor, "3 height width"]

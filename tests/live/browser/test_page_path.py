@@ -8,7 +8,7 @@ import pytest
 from live.browser import scene
 
 from viewmend.data.camera_path import read_camera_path
-from viewmend.data.synthetic.rigs import orbit
+from viewmend.studio.rigs import orbit
 
 pytestmark = pytest.mark.slow
 

@@ -34,11 +34,12 @@ from viewmend.contrib.baselines.token_transformers import NATIVE_PX, TokenTransf
 from viewmend.models.base import ContextProvider
 from viewmend.models.compositing import Background, composite, to_background
 from viewmend.training.adversarial import BETAS, HINGE, Adversary, Discriminator, Judged
-from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, load_start
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
 from viewmend.utils.atomic_writes import write_tensors, write_text
+from viewmend.utils.options import HIDDEN
 
 Framing = Literal["def", "win", "mul"]
 FRAMINGS: tuple[Framing, ...] = ("def", "win", "mul")

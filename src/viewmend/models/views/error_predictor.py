@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ErrorMap, RenderQuality
 from viewmend.models.compositing import blend
 from viewmend.models.network import Network
@@ -17,7 +18,6 @@ from viewmend.models.views.grid import (
     concatenate_channels,
     downsample2x,
     nearest_depth,
-    rim_depth,
     scatter_to_image,
     upsample2x,
 )

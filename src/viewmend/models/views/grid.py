@@ -4,21 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.types import RIM_PX, IncompleteView
+from viewmend.geometry.rim import BEYOND_M
+from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
 Pixels = Int[Tensor, "pixel 2"]
 """Row and column of pixels."""
 CELL_PX = 2
 """Depth hypotheses are judged in square cells of this side, pixels."""
-BEYOND_M = 1e30
-"""Pixels without a depth count as this far away, metres: ONNX Runtime's pooling cannot handle infinity."""
 TILE_PX = 32
 """The tiles of `run_tiled` have this side, pixels; it is a multiple of a cell's."""
 AT_ONCE = (8, 4, 2, 1)
@@ -27,22 +25,6 @@ BAND_PX = (3, 7)
 """Means over squares of these sides, pixels, separate the bands of detail."""
 WIDER = 16
 """The U-Net adds this many channels at each coarser scale."""
-
-
-def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """The depth, metres, extended by `RIM_PX` around the proxy with the smallest depth nearby; 0 elsewhere."""
-    far = torch.where(depth > 0, depth, BEYOND_M)
-    side = 2 * RIM_PX + 1
-    on_cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
-    if on_cpu and not torch.compiler.is_exporting():  # ten times as fast as PyTorch
-        import cv2
-
-        window = np.ones((side, side), np.uint8)
-        border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": BEYOND_M}
-        near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
-    else:
-        near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
-    return torch.where(near < BEYOND_M, torch.where(depth > 0, depth, near), 0.0)
 
 
 def downsample2x(view: IncompleteView) -> IncompleteView:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
 from viewmend.models.compositing import opaque_in_mask
@@ -36,7 +37,6 @@ from viewmend.models.views.grid import (
     detail_bands,
     index_image,
     nearest_depth,
-    rim_depth,
     run_tiled,
     scatter_to_image,
 )

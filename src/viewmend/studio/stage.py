@@ -1,0 +1,178 @@
+"""The studio: performers, lights and cameras as a capture with exact truth."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.data.errors import CaptureError
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.studio.imperfections import Imperfections, imperfect_cameras, imperfect_frame
+from viewmend.studio.performer import Performer, TexturedMesh, TexturePyramid, texture_pyramid
+from viewmend.studio.render import Surface, light, render, stage_backdrop, stage_lights
+from viewmend.studio.rigs import dome_rig, ring_rig
+from viewmend.types import MultiViewFrame
+from viewmend.utils.srgb import linear_from_srgb, srgb_from_linear
+
+BOUNDS_SAMPLES = 48
+BOUNDS_MARGIN_M = 0.08
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudioConfig:
+    """One capture of the studio; all randomness follows from `seed`."""
+
+    seed: int = 0
+    """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are
+    kept for tests and evaluation."""
+    cameras: int | Cameras = 12
+    """How many cameras the rig has, or the rig itself, in the stage's world."""
+    rig: Literal["ring", "dome"] = "ring"
+    """How a number of cameras is placed."""
+    frames: int = 30
+    """Length of the capture."""
+    size_px: int | tuple[int, int] = 512
+    """Images' width and height, or side of square ones; a rig that is given keeps its own."""
+    fps: float | int = 30.0
+    """Frames per second."""
+    performers: Path | None = None
+    """A glTF character (.glb, .gltf), or a folder of which one is picked; None for a procedural scene."""
+    motions: Path | None = None
+    """A BVH motion, or a folder of which one is picked; goes with `performers`."""
+    cloth_variety: float = 0.0
+    """Share of a glTF character's garments that get other colours or cloth by seed; 0 keeps them.
+    Procedural performers are always dressed by seed."""
+    background: Literal["black", "stage"] = "black"
+    """What the cameras see behind the subject; truth views always have black."""
+    samples_per_side: int = 2
+    """Each pixel is the mean of this many samples squared."""
+    imperfections: Imperfections = field(default_factory=Imperfections)
+    """Imperfections of the capture; none by default."""
+
+
+class Studio:
+    """A capture stage in software: a `CaptureSource` that also renders ground truth for any view."""
+
+    def __init__(self, config: StudioConfig | None = None, performer: Performer | None = None) -> None:
+        """Set up the stage.
+
+        Raises:
+            CaptureError: performers or motions that are missing, none in their folder, or unreadable.
+            ValueError: sizes or counts that are not positive, a variety of cloth beyond [0, 1].
+        """
+        self.config = config = config or StudioConfig()
+        size = (config.size_px, config.size_px) if isinstance(config.size_px, int) else config.size_px
+        if config.frames < 1 or not config.fps > 0 or min(size) < 1:
+            raise ValueError(
+                f"expected at least one frame, a positive rate and size, got {config.frames} frames at "
+                f"{config.fps}/s of {size} pixels; correct the studio's config"
+            )
+        seeds = map(int, np.random.SeedSequence(config.seed).generate_state(5))
+        performer_seed, rig_seed, light_seed, self._backdrop_seed, self._error_seed = seeds
+        self.performer = performer or _cast(config, performer_seed)
+        rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
+        given = config.cameras
+        self.name = f"studio {config.seed}: {self.performer.description}"
+        self.frame_ids = tuple(f"{time:06d}" for time in range(config.frames))
+        """Six digits each, from 000000."""
+        self.fps = float(config.fps) if config.frames > 1 else None
+        """Frames per second, None for a single frame."""
+        self.up = torch.tensor([0.0, 1.0, 0.0])
+        self.true_cameras = given if isinstance(given, Cameras) else rig(given, size, seed=rig_seed)
+        """True poses of the cameras; `cameras` has the calibration errors of the capture."""
+        self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
+        """The calibration of the capture, including its errors."""
+        self._lights = stage_lights(light_seed)
+        on_stage = config.background == "stage"
+        self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed) if on_stage else None
+        # Cache of the last frame, since a frame and its ground truth are read in pairs.
+        self._last_surface: tuple[int, Surface] | None = None
+        self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """Bounds of the performers over the capture, with a margin (sampled at most 48 times)."""
+        return self._bounds
+
+    @cached_property
+    def _bounds(self) -> Bounds:
+        count = min(self.config.frames, BOUNDS_SAMPLES)
+        times = np.linspace(0, self.config.frames - 1, count).round().astype(int)
+        corners = [self.scene(int(t)).mesh.vertices.aminmax(dim=0) for t in times]
+        low = torch.stack([c.min for c in corners]).amin(0) - BOUNDS_MARGIN_M
+        return Bounds(low, torch.stack([c.max for c in corners]).amax(0) + BOUNDS_MARGIN_M)
+
+    def scene(self, time: int) -> TexturedMesh:
+        """The performers' surface at index `time`, which may lie beyond the capture's frames."""
+        return self.performer.pose(time / self.config.fps)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """All cameras at index `time`: images and masks with the imperfections, and the true depth.
+
+        Raises:
+            IndexError: `time` is not in the capture.
+        """
+        if not 0 <= time < self.config.frames:
+            raise IndexError(f"expected a time from 0 to {self.config.frames - 1}, got {time}")
+        frame = self._draw(self.true_cameras, time, self._backdrop)
+        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
+        return replace(frame, cameras=self.cameras)
+
+    def truth(self, cameras: Cameras, time: int, on_stage: bool = False) -> MultiViewFrame:
+        """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
+
+        Colours are the subject's own, not darkened where the mask is soft: times the mask, they are the view on black.
+        With `on_stage`, and a stage, they include what is behind soft pixels, as in the images of real cameras.
+        """
+        if on_stage and self._backdrop is not None:
+            return self._draw(cameras, time, stage_backdrop(cameras, self._backdrop_seed))
+        frame = self._draw(cameras, time, None)
+        assert frame.mask is not None, "the studio draws masks"
+        share = (frame.mask[:, None].float() / 255).clamp_min(1 / 255)
+        straight = srgb_from_linear((linear_from_srgb(frame.rgb.float() / 255) / share).clamp(0, 1))
+        return replace(frame, rgb=(255 * straight).round().to(torch.uint8))
+
+    def _draw(self, cameras: Cameras, time: int, behind: Float[Tensor, "view 3 height width"] | None) -> MultiViewFrame:
+        return replace(render(self._surface(time), cameras, behind, self.config.samples_per_side), time=time)
+
+    def _surface(self, time: int) -> Surface:
+        if self._last_surface is None or self._last_surface[0] != time:
+            scene, pyramid = self.scene(time), self._last_pyramid
+            if pyramid is None or [*map(id, pyramid[0])] != [*map(id, scene.textures)]:
+                pyramid = self._last_pyramid = scene.textures, texture_pyramid(scene.textures)
+            self._last_surface = time, light(scene, self._lights, pyramid[1])
+        return self._last_surface[1]
+
+
+def _cast(config: StudioConfig, seed: int) -> Performer:
+    """The performer of the config."""
+    if config.performers is None and config.motions is None:
+        from viewmend.studio.procedural import procedural_scene
+
+        return procedural_scene(config.seed)
+    if config.performers is None or config.motions is None:
+        missing = "performers" if config.performers is None else "motions"
+        raise CaptureError(f"expected performers and motions together, got no {missing}; give both folders")
+    from viewmend.studio.gltf_performer import GltfPerformer
+
+    chance = np.random.default_rng(seed)
+    character = _pick(config.performers, (".glb", ".gltf"), chance)
+    motion = _pick(config.motions, (".bvh",), chance)
+    return GltfPerformer(character, motion, seed, config.frames / config.fps, config.cloth_variety)
+
+
+def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -> Path:
+    """The file itself, or one of the folder's."""
+    if place.is_file():
+        return place
+    files = sorted(f for f in place.iterdir() if f.suffix.lower() in suffixes) if place.is_dir() else []
+    if not files:
+        found = "no such files in it" if place.is_dir() else "no such folder or file"
+        raise CaptureError(f"{place}: expected a {' or '.join(suffixes)} file or a folder of them, found {found}")
+    return files[int(chance.integers(len(files)))]
