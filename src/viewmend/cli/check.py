@@ -153,8 +153,9 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
     if capture["frames"] == 1:
         frames = f"1 ('{capture['first_frame']}'), static"
     gaps = [f"{camera} at '{frame}'" for camera, frame in capture["gaps"]]
+    count = f"{capture['frames']} frame{'s' if capture['frames'] > 1 else ''}"
     lines = [
-        f"{capture['name']}: a capture with {len(capture['cameras'])} cameras",
+        f"{capture['name']}: a capture with {len(capture['cameras'])} cameras, {count}",
         f"  images    {', '.join(f'{w} x {h}' for w, h in sizes)}",
         f"  frames    {frames}",
         f"  masks     {'yes' if capture['masks'] else 'none (viewmend masks makes them)'}",

@@ -3,6 +3,7 @@
 import functools
 import io
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -48,16 +49,54 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def exif_rotation(path: Path) -> str | None:
-    """How EXIF asks viewers to rotate the image, in words; None if it does not, or if this is not an image."""
+@dataclass(frozen=True)
+class Orientation:
+    """How EXIF asks viewers to turn an image."""
+
+    transposed: bool
+    """Whether rows become columns, before the flips."""
+    flip_rows: bool
+    flip_columns: bool
+
+    def __str__(self) -> str:
+        if self.transposed:
+            return "turned by 90 degrees"
+        return "turned by 180 degrees" if self.flip_rows and self.flip_columns else "mirrored"
+
+    def apply(self, image: np.ndarray) -> np.ndarray:
+        """The image as viewers show it."""
+        turned = image.swapaxes(0, 1) if self.transposed else image
+        return np.ascontiguousarray(turned[:: -1 if self.flip_rows else 1, :: -1 if self.flip_columns else 1])
+
+    def undo(self, image: np.ndarray) -> np.ndarray:
+        """The image as it is stored, from the image that viewers show."""
+        stored = image[:: -1 if self.flip_rows else 1, :: -1 if self.flip_columns else 1]
+        return np.ascontiguousarray(stored.swapaxes(0, 1) if self.transposed else stored)
+
+
+ORIENTATIONS = {
+    2: Orientation(False, False, True),
+    3: Orientation(False, True, True),
+    4: Orientation(False, True, False),
+    5: Orientation(True, False, False),
+    6: Orientation(True, False, True),
+    7: Orientation(True, True, True),
+    8: Orientation(True, True, False),
+}
+"""The values of EXIF's orientation tag, except 1, which is upright."""
+
+
+def exif_orientation(path: Path) -> Orientation | None:
+    """How EXIF asks viewers to turn the image; None if it does not, or if this is not an image."""
     small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(read_bytes(path), np.uint8)
     stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
         return None
-    flips = ((-1, -1), (1, -1), (-1, 1))
-    if stored.shape != turned.shape or not any((stored[::y, ::x] == turned).all() for y, x in flips):
-        return "turned by 90 degrees"
-    return "turned by 180 degrees" if (stored[::-1, ::-1] == turned).all() else "mirrored"
+    for orientation in ORIENTATIONS.values():
+        shown = orientation.apply(stored)
+        if shown.shape == turned.shape and (shown == turned).all():
+            return orientation
+    return None
 
 
 def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:

@@ -20,7 +20,8 @@ from viewmend.data.formats import read_any_calibration
 from viewmend.data.images import (
     MAX_LABELS,
     RUN_LENGTH_SUFFIX,
-    exif_rotation,
+    Orientation,
+    exif_orientation,
     read_alpha,
     read_depth,
     read_mask,
@@ -355,8 +356,9 @@ class CameraReader:
 
     def __init__(self, folder: Path, camera: NativeCamera, frames: Sequence[str], clock: VideoClock | None):
         self.camera = camera
-        self.rotation: str | None = None
-        """How EXIF asks to rotate the first image that was read; "" if it does not."""
+        self.rotation: Orientation | None = None
+        """How EXIF asks viewers to turn the camera's images, by the first one that was read."""
+        self._rotation_is_known = False
         self.warned = False
         """Whether the user was warned of the rotation."""
         self._folder = folder
@@ -398,15 +400,17 @@ class CameraReader:
         rgb = self._video.read(int(self._index["images"][time]), where) if self._video else read_rgb(path, where)
         if rgb is None:
             return None
-        if self.rotation is None:
-            self.rotation = "" if self._video else exif_rotation(path) or ""
+        if not self._rotation_is_known:
+            self.rotation = None if self._video else exif_orientation(path)
+            self._rotation_is_known = True
         self._check_size(rgb, where, self.rotation)
         mask, depth = None, None
         if camera.mask:
             path, where = self.locate("mask", time)
             if (mask := self._read_mask(path, where, time)) is None:
                 return None
-            self._check_size(mask, where)
+            mask = self._as_stored(mask, path)
+            self._check_mask_size(mask, where)
         if camera.depth:
             path, where = self.locate("depth", time)
             depth = read_depth(path, where)
@@ -444,7 +448,29 @@ class CameraReader:
         path = self._folder / self.camera.file(kind, self._file_id(kind, time))
         return path, f"{path}: camera '{self.camera.name}', frame '{self._frames[time]}'"
 
-    def _check_size(self, image: np.ndarray, where: str, rotation: str = "") -> None:
+    def _as_stored(self, mask: UInt8[np.ndarray, "rows columns"], path: Path) -> UInt8[np.ndarray, "height width"]:
+        """A mask that lies as its image: another tool may have turned it as EXIF says, or not have turned it.
+
+        A mask of the transposed size is turned back as the image's own EXIF says, or else as the mask's says.
+        """
+        camera = self.camera
+        if mask.shape != (camera.width, camera.height) or camera.width == camera.height:
+            return mask
+        if self.rotation is not None and self.rotation.transposed:
+            return self.rotation.undo(mask)
+        own = None if self._mask_video or path.suffix == RUN_LENGTH_SUFFIX else exif_orientation(path)
+        return mask if own is None or not own.transposed else own.apply(mask)
+
+    def _check_mask_size(self, mask: UInt8[np.ndarray, "rows columns"], where: str) -> None:
+        if mask.shape == (self.camera.width, self.camera.height) and self.camera.width != self.camera.height:
+            expected = f"a mask of {self.camera.width} x {self.camera.height} pixels as its image"
+            got = f"{mask.shape[1]} x {mask.shape[0]}: the mask is turned by 90 degrees and the image is not"
+            raise CaptureError(
+                f"{where}: expected {expected}, got {got} (neither has EXIF that says how); turn the mask"
+            )
+        self._check_size(mask, where)
+
+    def _check_size(self, image: np.ndarray, where: str, rotation: Orientation | None = None) -> None:
         height, width = image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             advice = "correct width, height and K in the calibration, or replace the file"

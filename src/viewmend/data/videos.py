@@ -25,7 +25,12 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".mxf", ".flv"),
+    *(".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg", ".m2v", ".ivf", ".obu", ".y4m", ".nut"),
+    *(".3gp", ".3g2", ".asf", ".dv", ".f4v", ".m2t", ".mod", ".tod", ".mpe", ".mpv", ".ogv", ".qt", ".vob", ".gxf"),
+)
+"""Suffixes of containers, of raw streams, and of camcorders."""
 SMPTE170M, BT709, VIDEO_RANGE = 6, 1, 1
 """ITU-T H.273 codes: the matrix of BT.601, primaries and transfer of BT.709, and luma from 16 to 235."""
 ABSOLUTE_TIMES = {"mp4", "matroska"}

@@ -1,12 +1,30 @@
-"""Agisoft Metashape's XML export of cameras. Each aligned image is a camera of a single frame."""
+"""Agisoft Metashape's XML export of cameras. Each aligned image is a camera of a single frame.
 
+Photos without a pose of their own are left out with a warning: those that were not aligned, and the secondary cameras
+of multi-camera systems, whose pose Metashape stores relative to the primary camera.
+"""
+
+from collections import Counter
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from jaxtyping import Float64
 
-from viewmend.data.formats.files import files_like, find_mask, names_from_paths, read_xml, xml_attributes, xml_number
+from viewmend.data.formats.files import (
+    existing,
+    files_like,
+    find_mask,
+    listed,
+    names_from_paths,
+    read_xml,
+    warn,
+    warn_of_unused_images,
+    xml_attributes,
+    xml_number,
+)
+from viewmend.data.formats.moments import PosedImage, fixed_cameras
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**24
@@ -27,22 +45,72 @@ def find(folder: Path) -> Path | None:
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
     """The aligned images of the chunk that has most, in the folder or in `images`, in the chunk's unit."""
-    chunks = [(chunk, _used_cameras(chunk)) for chunk in read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")]
-    chunk, used = max(chunks, key=lambda pair: len(pair[1]), default=(None, []))
+    chunks = read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")
+    chunk = max(chunks, key=lambda chunk: len(_used_cameras(chunk)), default=None)
+    used = [] if chunk is None else _used_cameras(chunk)
     if chunk is None or not used:
         raise ValueError("expected a chunk with aligned cameras, got none; align the photos and export them again")
+    _warn_of_others(file, chunk, used)
+    used = existing(folder, used, lambda camera: _find_image(folder, camera.get("label", "")))
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
     images = [_find_image(folder, camera.get("label", "")) for camera in used]
+    known = [_find_image(folder, camera.get("label", "")) for camera in chunk.iter("camera")]
+    warn_of_unused_images(folder, known)
+    posed = []
+    for camera, image in zip(used, images, strict=True):
+        label = camera.get("label", "")
+        R, center = _pose(label, camera, chunk)
+        mask, lens = (
+            find_mask(folder, image.removeprefix("images/")),
+            _lens(label, sensors.get(camera.get("sensor_id"))),
+        )
+        posed.append(PosedImage(image, mask, lens, R, center))
+    if (rig := fixed_cameras(posed)) is not None:
+        cameras, frames = rig
+        return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
     entries = []
-    for camera, image, name in zip(used, images, names_from_paths(images), strict=True):
-        entry = {"name": name, **_lens(name, sensors.get(camera.get("sensor_id"))), **_pose(name, camera, chunk)}
-        entries.append(entry | {"image": image, "mask": find_mask(folder, image.removeprefix("images/"))})
+    for image, name in zip(posed, names_from_paths(images), strict=True):
+        pose = {"R": image.R.tolist(), "t": (-image.R @ image.center).tolist()}
+        entries.append({"name": name, **image.lens, **pose, "image": image.path, "mask": image.mask})
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
 
 
 def _used_cameras(chunk: Element) -> list[Element]:
-    cameras = chunk.findall("./cameras//camera")
-    return [c for c in cameras if c.find("transform") is not None and c.get("enabled", "1").lower() in ("1", "true")]
+    """The enabled cameras with a pose, of the component that has most of them: components do not share a world."""
+    posed = [camera for camera in _cameras(chunk) if _is_enabled(camera) and camera.find("transform") is not None]
+    components = Counter(camera.get("component_id") for camera in posed)
+    largest = components.most_common(1)[0][0] if components else None
+    return [camera for camera in posed if camera.get("component_id") == largest]
+
+
+def _cameras(chunk: Element) -> list[Element]:
+    return chunk.findall("./cameras//camera")
+
+
+def _is_enabled(camera: Element) -> bool:
+    return camera.get("enabled", "1").lower() in ("1", "true")
+
+
+def _warn_of_others(file: Path, chunk: Element, used: list[Element]) -> None:
+    """Name the photos of a chunk that are not used, by the reason."""
+    reasons: dict[str, list[str]] = {}
+    for camera in _cameras(chunk):
+        if camera in used:
+            continue
+        if not _is_enabled(camera):
+            reason = "photos that are disabled in Metashape are left out"
+        elif camera.find("transform") is not None:
+            reason = "photos that are aligned only among themselves (another component) are left out"
+        elif camera.get("master_id") is not None:
+            reason = (
+                "photos of a multi-camera system without a pose of their own are left out (split the system into "
+                "single cameras in Metashape and export again)"
+            )
+        else:
+            reason = "photos that were not aligned are left out"
+        reasons.setdefault(reason, []).append(camera.get("label", ""))
+    for reason, labels in reasons.items():
+        warn(f"{file}: {reason}: {listed(labels)}")
 
 
 def _find_image(folder: Path, label: str) -> str:
@@ -77,7 +145,8 @@ def _value(name: str, lens: Element, key: str) -> float:
     return 0.0 if found is None else xml_number(f"camera '{name}': {key}", found.text)
 
 
-def _pose(name: str, camera: Element, chunk: Element) -> dict[str, Any]:
+def _pose(name: str, camera: Element, chunk: Element) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """Rotation of camera_from_world and the camera's position."""
     chunk_from_camera = _numbers(name, camera.find("transform"), 16).reshape(4, 4)
     number = camera.get("component_id", "")
     component = chunk.find(f"./components/component[@id='{number if number.isdecimal() else ''}']/transform")
@@ -89,7 +158,7 @@ def _pose(name: str, camera: Element, chunk: Element) -> dict[str, Any]:
         scale = xml_number(f"camera '{name}': scale", transform.findtext("scale"))
     R = (turn @ chunk_from_camera[:3, :3]).T
     centre = scale * turn @ chunk_from_camera[:3, 3] + shift
-    return {"R": R.tolist(), "t": (-R @ centre).tolist()}
+    return R, centre
 
 
 def _numbers(name: str, element: Element | None, count: int) -> np.ndarray:

@@ -1,20 +1,24 @@
-"""COLMAP's sparse model, text or binary. Each image is a camera of a single frame."""
+"""COLMAP's sparse model, text or binary.
+
+Each image is a camera of a single frame, unless poses and names show that a fixed rig was recorded at several times.
+"""
 
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from viewmend.data.formats.files import (
-    IMAGE_SUFFIXES,
     decode_text,
     existing,
     find_mask,
     folders_containing,
     names_from_paths,
-    warn,
+    warn_of_unused_images,
 )
+from viewmend.data.formats.moments import PosedImage, fixed_cameras
 from viewmend.utils.untrusted_input import bounded_bytes
 
 IMAGES = "images.txt"
@@ -85,20 +89,57 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     """All images of the model. The unit is arbitrary, as in COLMAP."""
     lenses, views = _read(file)
     prefix = "images/" if (folder / "images").is_dir() else ""
-    known = {view.name for view in views}
+    known = [prefix + view.name for view in views]
     views = existing(folder, views, lambda view: prefix + view.name)
-    unused = sorted(set(_images_in(folder / "images")) - known) if prefix else []
-    if unused:
-        warn(f"{file.parent}: images that are not in the model are ignored: {', '.join(unused)[:200]}")
-    entries = []
-    for view, name in zip(views, names_from_paths([view.name for view in views]), strict=True):
+    if prefix:
+        warn_of_unused_images(folder, known)
+    images = []
+    for view in views:
         if view.camera not in lenses:
             expected = f"a camera with the id {view.camera} of image '{view.name[:40]}'"
             raise ValueError(f"expected {expected}, got none; export the model again")
-        mask = find_mask(folder, view.name)
-        entry = {"name": name, **lenses[view.camera], **_pose(view)}
-        entries.append(entry | {"image": prefix + view.name, "mask": mask})
+        R, t = _rotation(view), np.array(view.t)
+        images.append(PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t))
+    if (rig := fixed_cameras(images)) is not None:
+        cameras, frames = rig
+        return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
+    if (moments := _count_moments(file)) > 1:
+        got = f"{moments} frames of a rig, {file.with_stem('frames').name}, in which cameras have several poses"
+        raise ValueError(f"expected a fixed rig or images of one moment, got {got}; write one model for each frame")
+    entries = []
+    for image, view, name in zip(images, views, names_from_paths([view.name for view in views]), strict=True):
+        pose = {"R": image.R.tolist(), "t": view.t}
+        entries.append({"name": name, **image.lens, **pose, "image": image.path, "mask": image.mask})
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
+
+
+def _count_moments(file: Path) -> int:
+    """How many frames of two images or more COLMAP's file of frames lists; 0 without such a file."""
+    frames = file.with_stem("frames")
+    if not frames.is_file():
+        return 0
+    data = bounded_bytes(frames, MAX_BYTES)
+    try:
+        counts = _binary_frame_sizes(data) if file.suffix == ".bin" else _text_frame_sizes(data)
+    except (struct.error, ValueError, IndexError):
+        return 0
+    return sum(count > 1 for count in counts)
+
+
+def _binary_frame_sizes(data: bytes) -> list[int]:
+    """The number of images of each frame: after an id, the rig's id and a pose, then 16 bytes for each image."""
+    (count,), at, sizes = struct.unpack_from("<Q", data), 8, []
+    for _ in range(count):
+        (size,) = struct.unpack_from("<I", data, at + 64)
+        at += 68 + 16 * size
+        sizes.append(size)
+    return sizes
+
+
+def _text_frame_sizes(data: bytes) -> list[int]:
+    """The number of images of each frame, which follows two ids and a pose of seven numbers."""
+    lines = [line.split() for line in decode_text(data, "frames.txt").splitlines()]
+    return [int(words[9]) for words in lines if words and not words[0].startswith("#")]
 
 
 def _binary_lenses(data: bytes) -> dict[int, dict[str, Any]]:
@@ -176,12 +217,6 @@ def _bad_line(file: str, number: int, expected: str, line: str) -> ValueError:
     return ValueError(f"{file}: expected {expected} in line {number}, got {got}; export the model again")
 
 
-def _images_in(folder: Path) -> list[str]:
-    """Paths of the images in a folder and its subfolders, relative to it."""
-    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    return [path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)]
-
-
 def _parameters(model: str) -> list[str]:
     if model not in MODELS:
         expected = ", ".join(MODELS)
@@ -202,15 +237,16 @@ def _lens(model: str, width: int, height: int, values: list[float]) -> dict[str,
     return {"width": width, "height": height, "K": K, "dist": dist}
 
 
-def _pose(view: ColmapImage) -> dict[str, Any]:
+def _rotation(view: ColmapImage) -> Float64[np.ndarray, "3 3"]:
+    """Rotation of camera_from_world, from the quaternion."""
     quaternion = np.array(view.quaternion)
     norm = np.linalg.norm(quaternion)
     if not (np.isfinite(norm) and norm > 0):
         raise ValueError(f"expected a rotation of image '{view.name[:40]}', got {view.quaternion}; export it again")
     w, x, y, z = quaternion / norm
-    R = [
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return {"R": np.array(R).tolist(), "t": view.t}
+    return np.array(rows)

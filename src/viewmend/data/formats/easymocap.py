@@ -34,7 +34,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         raise ValueError("expected cameras whose names are valid folder names, got none; export it again")
     footage = find_footage(folder, names, PLACES)
     entries = []
-    for name in names:
+    for name in (name for name in names if name in footage):
         K = _matrix(intrinsics, f"K_{name}", 9).reshape(3, 3)
         W, H = intrinsics.get(f"W_{name}"), intrinsics.get(f"H_{name}")
         size = (W, H) if isinstance(W, float) and isinstance(H, float) and W and H else None

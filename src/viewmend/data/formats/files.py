@@ -4,7 +4,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
@@ -39,6 +39,8 @@ IMAGE_SUFFIXES = (
 )
 HIDDEN = ("__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN")
 """Folders of file managers; other files and folders of theirs start with a dot."""
+MAX_LISTED = 8
+"""Messages list up to this many names."""
 MAX_CROP_PX = 16
 """Encoders round sizes down to whole blocks; the calibration of a slightly larger image stays valid."""
 
@@ -87,6 +89,13 @@ def names_from_paths(paths: Sequence[str]) -> list[str]:
     return [str(PurePosixPath(path).with_suffix("")).replace("/", "_") if path else path for path in paths]
 
 
+def names_of_patterns(patterns: Sequence[str]) -> list[str]:
+    """A name for each camera: what its images' names share."""
+    shared = [path.rpartition(".")[0].replace("{frame}", "").rstrip("_-./ ") for path in patterns]
+    short = [path.rpartition("/")[2] for path in shared]
+    return short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
+
+
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
     """The items whose image is in the folder, with a warning of the others; all of them if fewer than two exist."""
     paths = [(number, path(item)) for number, item in enumerate(items) if stays_inside(path(item))]
@@ -96,6 +105,17 @@ def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -
     names = ", ".join(path(items[number]) for number in missing)
     warn(f"{folder}: cameras without their image are left out: {names[:200]}")
     return [item for number, item in enumerate(items) if number not in missing]
+
+
+def warn_of_unused_images(folder: Path, used: Iterable[str]) -> None:
+    """Name the images in `images` that a calibration does not mention, by paths relative to the capture."""
+    place = folder / "images"
+    if not place.is_dir():
+        return
+    found = (path.relative_to(folder) for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    images = {path.as_posix() for path in found if not any(_is_hidden(part) for part in path.parts)}
+    if unused := sorted(images - set(used)):
+        warn(f"{folder}: images that the calibration does not mention are ignored: {listed(unused)}")
 
 
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
@@ -159,6 +179,9 @@ class Footage:
     entries: dict[str, dict[str, Any]]
     """The keys of a `cameras.json` for a camera's size, images and masks, by its name."""
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.entries
+
     def entry(self, name: str, calibrated_px: Sequence[int | float] | None = None) -> dict[str, Any]:
         """The keys of one camera; ValueError unless its images have the size that it was calibrated at, if known."""
         entry = self.entries[name]
@@ -184,22 +207,76 @@ class ImageList:
 def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLACES) -> Footage:
     """Find videos, or folders of images, that are named after the cameras; likewise their masks, if any.
 
-    ValueError if no place has footage of every camera, or only some cameras have masks.
+    Cameras without footage, such as those of a motion capture system that record markers only, are left out with a
+    warning if two or more cameras have some.
+
+    Raises:
+        ValueError: fewer than two cameras have footage, a camera has several videos, or only some have masks.
     """
-    for place in places:
-        only = [f"{place}/{name}" for name in _subfolders(folder / place)] if place == "recordings" else []
-        for where in (place, *(only if len(only) == 1 else ())):
-            for found in (_videos(folder, where), _folders(folder, where)):
-                if paths := match_names(names, found):
-                    return collect_footage(folder, dict(zip(names, paths, strict=True)))
+    candidates = [paths for place in places for paths in _footage_in(folder, place)]
+    shown = [[path for path in paths if is_video(path) or _has_footage(folder, path)] for paths in candidates]
+    for paths in (*shown, *candidates):
+        if match_names(names, paths):
+            return _found_footage(folder, names, paths)
+    best = max(shown, key=lambda paths: len(_match_some(names, paths)), default=[])
+    if len(_match_some(names, best)) < 2:
+        raise ValueError(_without_footage(folder, names, places))
+    return _found_footage(folder, names, best)
+
+
+def _found_footage(folder: Path, names: Sequence[str], paths: Sequence[str]) -> Footage:
+    """The footage of the cameras among these paths; warns of cameras and paths that have no counterpart."""
+    match = _match_some(names, paths)
+    if match.several:
+        raise ValueError(_several_videos(match.several))
+    if absent := [name for name in names if name not in match.paths]:
+        warn(f"{folder}: cameras without footage are left out: {listed(absent)}")
+    used = set(match.paths.values())
+    unused = [path for path in paths if path not in used and "/" in path and not _without_subject(path)]
+    if unused:
+        warn(f"{folder}: footage of no calibrated camera is not used: {listed(unused)}")
+    return collect_footage(folder, match.paths)
+
+
+def _footage_in(folder: Path, place: str) -> Iterator[list[str]]:
+    """The videos of a place, then its folders; in `recordings`, also those of its only subfolder."""
+    only = [f"{place}/{name}" for name in _subfolders(folder / place)] if place == "recordings" else []
+    for where in (place, *(only if len(only) == 1 else ())):
+        yield _videos(folder, where)
+        yield _folders(folder, where)
+
+
+def _without_footage(folder: Path, names: Sequence[str], places: Sequence[str]) -> str:
+    """The error of a folder in which fewer than two cameras have footage."""
     inner = [place for place in PLACES if place]
     within = [*_subfolders(folder), *(f"{a}/{b}" for a in _subfolders(folder) for b in _subfolders(folder / a))]
     trials = [name for name in within if any((folder / name / place).is_dir() for place in inner)]
     if trials:
-        raise ValueError(f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these")
+        return f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these"
     searched = ", ".join(place or "the folder" for place in places)
-    expected = f"a video or a folder of images named after each camera ({', '.join(names)[:80]})"
-    raise ValueError(f"expected {expected} in {searched}, got none; rename them")
+    expected = f"a video or a folder of images named after each camera ({listed(names)}) in {searched}"
+    for place in places:
+        others = [f"{place}/{name}".removeprefix("/") for name in _files(folder / place) if not is_video(name)]
+        unknown = _match_some(names, [path for path in others if Path(path).suffix.lower() not in IMAGE_SUFFIXES])
+        if len(unknown) >= 2 and not unknown.several:
+            got = listed(list(unknown.paths.values()))
+            command = "ffmpeg -i FILE -c copy FILE.mp4"
+            return f"expected {expected}, got files of an unknown kind ({got}); convert them to MP4 or MKV: {command}"
+    return f"expected {expected}, got none; rename them"
+
+
+def _several_videos(several: dict[str, list[str]]) -> str:
+    """The error of cameras with several videos."""
+    name, paths = next(iter(several.items()))
+    more = f", and likewise for {listed(list(several)[1:])}" if len(several) > 1 else ""
+    advice = "join the chapters of one recording (ffmpeg -f concat -safe 0 -i LIST.txt -c copy OUT.mp4), or keep one"
+    return f"expected one video of camera '{name}', got {len(paths)} ({listed(paths)}){more}; {advice}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names separated by commas; of many, the first ones and how many more there are."""
+    shown = list(names[:MAX_LISTED])
+    return ", ".join(shown) + (f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else "")
 
 
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
@@ -211,7 +288,11 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
     entries, ids, ignored = {}, {}, []
-    paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
+    shown = {name: _videos_of_subject(folder, path) for name, path in paths.items()}
+    several = {name: found for name, found in shown.items() if len(found) > 1 and not list_images(folder, paths[name])}
+    if several:
+        raise ValueError(_several_videos(several))
+    paths = {name: shown[name][0] if len(shown[name]) == 1 else path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
         if (video := videos.get(name)) is not None:
@@ -323,18 +404,49 @@ def frame_order(frame: str) -> tuple[int, str]:
     return len(frame), frame
 
 
+@dataclass(frozen=True)
+class NameMatch:
+    """Paths that are named after cameras."""
+
+    paths: dict[str, str]
+    """The only path of each camera that has one, by its name."""
+    several: dict[str, list[str]]
+    """The paths of each camera that has more than one."""
+
+    def __len__(self) -> int:
+        return len(self.paths) + len(self.several)
+
+
 def match_names(names: Sequence[str], paths: Iterable[str]) -> list[str] | None:
     """The path of each camera name, by the first of several comparisons that assigns exactly one to each; else None."""
-    names = [normalize("NFC", name) for name in names]
-    stems = {path: normalize("NFC", Path(path).stem if is_video(path) else Path(path).name) for path in paths}
+    match = _match_some(names, paths)
+    return [match.paths[name] for name in names] if len(match.paths) == len(names) else None
+
+
+def _match_some(names: Sequence[str], paths: Iterable[str]) -> NameMatch:
+    """The paths of as many cameras as possible, by the first comparison of names that finds most."""
+    files = {path: normalize("NFC", Path(path).name) for path in paths}
+    stems = {path: Path(name).stem if _has_file_suffix(name) else name for path, name in files.items()}
+    best = NameMatch({}, {})
     for key in _KEYS:
         by_key: dict[Hashable, list[str]] = {}
         for path, stem in stems.items():
             by_key.setdefault(key(stem), []).append(path)
-        keys = [key(name) for name in names]
-        if None not in keys and len(set(keys)) == len(keys) and all(len(by_key.get(k, ())) == 1 for k in keys):
-            return [by_key[k][0] for k in keys]
-    return None
+        keys = {name: key(normalize("NFC", name)) for name in names}
+        counts = Counter(keys.values())
+        named = {name: by_key.get(k, []) for name, k in keys.items() if k is not None and counts[k] == 1}
+        match = NameMatch(
+            {name: found[0] for name, found in named.items() if len(found) == 1},
+            {name: found for name, found in named.items() if len(found) > 1},
+        )
+        if (len(match), len(match.paths)) > (len(best), len(best.paths)):
+            best = match
+    return best
+
+
+def _has_file_suffix(name: str) -> bool:
+    """Whether a name ends with the suffix of a video, or with an unknown suffix that has letters: `cam.1` has none."""
+    return is_video(name) or re.search(r"\.\w*[a-zA-Z]\w{0,4}$", name) is not None
 
 
 def _after_cam(text: str) -> str:
@@ -358,22 +470,35 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str,
     if not places:
         return {}
     place = next((place for place in places if _videos(folder, place) or _folders(folder, place)), places[0])
-    paths = match_names(names, _videos(folder, place)) or match_names(names, _folders(folder, place))
-    if paths is None:
-        raise ValueError(f"expected masks of each camera in {place}, got others; name them after the cameras")
+    match = max(_match_some(names, _videos(folder, place)), _match_some(names, _folders(folder, place)), key=len)
+    if match.several:
+        raise ValueError(f"{place}: {_several_videos(match.several)}")
+    if absent := [name for name in names if name not in match.paths]:
+        expected = f"masks of each camera in {place}"
+        raise ValueError(f"expected {expected}, got none of {listed(absent)}; name them after the cameras")
     labels = {"mask_labels": True} if place in LABELS else {}
     found = {}
-    for name, path in zip(names, paths, strict=True):
+    for name in names:
+        path = match.paths[name]
         images = None if is_video(path) else list_images(folder, path)
         pattern = images.pattern if images else path if is_video(path) else f"{path}/{{frame}}.png"
         found[name] = {"mask": pattern} | labels, images.frames if images else frozenset()
     return found
 
 
-def _only_video(folder: Path, path: str) -> str | None:
-    """The only video in a camera's folder that shows the subject."""
-    found = [video for video in _videos(folder, path) if not NO_SUBJECT.search(Path(video).name.lower())]
-    return found[0] if len(found) == 1 else None
+def _videos_of_subject(folder: Path, path: str) -> list[str]:
+    """The videos in a camera's folder that show the subject."""
+    return [video for video in _videos(folder, path) if not _without_subject(video)]
+
+
+def _has_footage(folder: Path, path: str) -> bool:
+    """Whether a folder holds images or videos."""
+    return bool(_videos(folder, path)) or list_images(folder, path) is not None
+
+
+def _without_subject(path: str) -> bool:
+    """Whether the name of some footage is that of a background or of a calibration board."""
+    return NO_SUBJECT.search(Path(path).name.lower()) is not None
 
 
 def _videos(folder: Path, place: str) -> list[str]:

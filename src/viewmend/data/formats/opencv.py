@@ -51,7 +51,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     cameras = _cameras(folder)
     footage = find_footage(folder, [name for name, _ in cameras])
     entries = []
-    for name, path in cameras:
+    for name, path in ((name, path) for name, path in cameras if name in footage):
         values = _values(read_storage(path))
         W, H = values.get("width"), values.get("height")
         size = (float(W), float(H)) if isinstance(W, int | float) and isinstance(H, int | float) else None

@@ -48,7 +48,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     cameras = [(str(table.get("name", key)), table) for key, table in lenses if not table.get("ignore")]
     footage = find_footage(folder, [name for name, _ in cameras])
     entries = []
-    for name, table in cameras:
+    for name, table in ((name, table) for name, table in cameras if name in footage):
         if table.get("fisheye"):
             raise ValueError(f"camera '{name}': expected a lens without fisheye, got one; undistort the images first")
         size = table.get("size")

@@ -23,12 +23,13 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras, in metres."""
+    """All cameras that have footage, in metres. Marker cameras of the same system have none."""
     cameras = read_xml(bounded_bytes(file, MAX_BYTES)).findall("./cameras/camera")
     names = [camera.get("serial", "") for camera in cameras]
     footage = find_footage(folder, names)
     entries = []
-    for name, camera in zip(names, cameras, strict=True):
+    recorded = [(name, camera) for name, camera in zip(names, cameras, strict=True) if name in footage]
+    for name, camera in recorded:
         left, right, top, bottom = xml_attributes(name, camera.find("fov_video"), "left right top bottom")
         entries.append(footage.entry(name, [right - left + 1, bottom - top + 1]) | _calibration(name, camera))
     return {"frames": footage.frames, "fps": footage.fps, "up": [0.0, 0.0, 1.0], "cameras": entries}

@@ -17,6 +17,7 @@ from viewmend.data.formats.files import (
     frame_pattern,
     image_size_px,
     names_from_paths,
+    names_of_patterns,
     warn,
 )
 from viewmend.data.images import uses_alpha
@@ -109,7 +110,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     alpha = not named and any(uses_alpha(folder / f.file_path) for f in frames if stays_inside(f.file_path))
     cameras, ids = _cameras_of(frames)
     paths = [camera[0].file_path for camera in cameras]
-    names = names_from_paths(paths) if len(ids) == 1 else _names_of_patterns(paths)
+    names = names_from_paths(paths) if len(ids) == 1 else names_of_patterns(paths)
     entries = []
     for (pattern, frame), name in zip(cameras, names, strict=True):
         world_from_camera = np.array(frame.transform_matrix, float)[:3]
@@ -187,13 +188,6 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
                 raise ValueError(f"expected equal 'time' for equal numbers in {key}, got others; round them alike")
         cameras.append((structs.replace(entries[0], **patterns), entries[0]))
     return cameras, tuple(ids[time] for time in sorted(times))  # pyright: ignore[reportArgumentType]
-
-
-def _names_of_patterns(patterns: list[str]) -> list[str]:
-    """A name for each camera: what its images' names share."""
-    shared = [path.rpartition(".")[0].replace("{frame}", "").rstrip("_-./ ") for path in patterns]
-    short = [path.rpartition("/")[2] for path in shared]
-    return short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
 
 
 def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str, Any]:

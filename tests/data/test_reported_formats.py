@@ -1,0 +1,192 @@
+"""Faults that users of other tools reported in public: calibrations and folders that do not match one to one."""
+
+import re
+import xml.etree.ElementTree as ET
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from reference.ball import BallCapture, ring
+from reference.films import picture, write_film
+from reference.foreign_formats import write_colmap, write_easymocap
+from reference.foreign_images import write_agisoft
+from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
+from reference.random_rigs import opencv, random_rig, write_images
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.native_capture import open_capture
+from viewmend.data.native_writer import write_capture
+
+EASYMOCAP, QUALISYS, POSE2SIM, OPENCV = "easymocap", "qualisys", "pose2sim", "opencv"
+
+
+def rig_of(count):
+    """A rig whose cameras all have images of 64 x 48 pixels."""
+    return [camera | {"width": 64, "height": 48} for camera in random_rig(5, count)]
+
+
+def write_calibration(folder, rig, format):
+    writers = {EASYMOCAP: write_easymocap, QUALISYS: write_qualisys, POSE2SIM: write_toml, OPENCV: write_opencv}
+    places = {QUALISYS: folder / "session.qca.txt", POSE2SIM: folder / "Calib.toml"}
+    folder.mkdir(parents=True, exist_ok=True)
+    style = {"style": "files"} if format == OPENCV else {}
+    writers[format](places.get(format, folder), rig if format == QUALISYS else opencv(rig), **style)
+
+
+@pytest.mark.parametrize("format", [EASYMOCAP, QUALISYS, POSE2SIM, OPENCV])
+def test_cameras_without_footage_are_left_out_and_named(tmp_path, caplog, format):
+    rig = rig_of(5)
+    write_calibration(tmp_path, rig, format)
+    for camera in rig[:3]:
+        write_film(tmp_path / f"videos/{camera['name']}.mp4", [picture(n) for n in range(3)])
+    write_film(tmp_path / "videos/witness.mp4", [picture(n) for n in range(3)])
+    write_film(tmp_path / "videos/background.mp4", [picture(0)])
+    capture = open_capture(tmp_path)
+    assert list(capture.cameras.names) == [camera["name"] for camera in rig[:3]]
+    assert f"without footage are left out: {rig[3]['name']}, {rig[4]['name']}" in caplog.text
+    assert "no calibrated camera is not used: videos/witness.mp4" in caplog.text and "background" not in caplog.text
+
+
+@pytest.mark.parametrize("names", ["{}/GX0{}0042.MP4", "{}_GX0{}0042.MP4"])
+def test_several_films_of_a_camera_are_named(tmp_path, names):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    for camera in rig:
+        for chapter in (1, 2):
+            write_film(tmp_path / "videos" / names.format(camera["name"], chapter), [picture(chapter)])
+    with pytest.raises(CaptureError, match=r"expected one video of camera .*GX010042.*GX020042.*join the chapters"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("h264", "libx264"), ("264", "libx264"), ("mxf", "mpeg2video")])
+def test_films_of_other_recorders_are_opened(tmp_path, suffix, codec):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    for camera in rig:
+        path = tmp_path / f"videos/{camera['name']}.{suffix}"
+        write_film(path, [picture(n) for n in range(4)], codec=codec, fps=25, options={"bf": "0"})
+    capture = open_capture(tmp_path)
+    assert len(capture.frame_ids) == 4 and capture.read(3).rgb.shape == (3, 3, 48, 64)
+
+
+def test_films_of_an_unknown_kind_are_named(tmp_path):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    (tmp_path / "videos").mkdir()
+    for camera in rig:
+        (tmp_path / f"videos/{camera['name']}.braw").write_bytes(b"raw")
+    with pytest.raises(CaptureError, match=rf"unknown kind \(videos/{rig[0]['name']}.braw.*convert them to MP4"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.remove(c.find("transform")), "not aligned are left out: .*cam"),
+        (lambda c: c.set("enabled", "0"), "disabled in Metashape are left out: .*cam"),
+        (lambda c: c.set("component_id", "9"), "another component.* are left out: .*cam"),
+        (lambda c: [c.set("master_id", "0"), c.remove(c.find("transform"))], "multi-camera system .*: .*cam"),
+    ],
+)
+def test_photos_of_metashape_that_are_not_used_are_named(tmp_path, caplog, change, message):
+    rig = rig_of(4)
+    write_agisoft(tmp_path / "cameras.xml", rig)
+    write_images(tmp_path, rig)
+    Image.new("RGB", (9, 9)).save(tmp_path / "images/never.png")
+    tree = ET.parse(tmp_path / "cameras.xml")
+    change(tree.findall(".//cameras//camera")[2])
+    tree.write(tmp_path / "cameras.xml")
+    capture = open_capture(tmp_path)
+    assert len(capture.cameras) == 3
+    (found,) = (r.message for r in caplog.records if "left out" in r.message and rig[1]["name"] in r.message)
+    assert re.search(message, found)
+    assert "does not mention are ignored: images/never.png" in caplog.text
+
+
+def several_times(rig, layout, shift=0.0):
+    """Each camera of a rig at three times, as images of a reconstruction; positions differ by `shift`."""
+    rng = np.random.default_rng(1)
+    images = []
+    for time in (0, 8, 16):
+        for camera in rig:
+            path = layout.format(camera=camera["name"], time=time)
+            t = camera["t"] + camera["R"] @ rng.uniform(-shift, shift, 3)
+            images.append(camera | {"name": path, "t": t, "image": f"images/{path}.png", "mask": f"masks/{path}.png"})
+    return images
+
+
+def write_flat_images(folder, images):
+    for image in images:
+        for kind in ("image", "mask"):
+            path = folder / image[kind]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.full((image["height"], image["width"], 3), 200, np.uint8))
+
+
+@pytest.mark.parametrize("layout", ["{camera}/{time:06d}", "{time:04d}/{camera}", "{camera}_{time:03d}"])
+@pytest.mark.parametrize("shift", [0.0, 0.002])
+@pytest.mark.parametrize("binary", [False, True])
+def test_times_of_colmap_are_frames(tmp_path, layout, shift, binary):
+    rig = rig_of(4)
+    images = several_times(rig, layout, shift)
+    write_flat_images(tmp_path, images)
+    write_colmap(tmp_path, opencv(images), binary=binary)
+    capture = open_capture(tmp_path)
+    assert len(capture.cameras) == 4 and len(capture.frame_ids) == 3 and capture.has_masks and not capture.gaps
+    found = dict(zip(capture.cameras.names, capture.cameras.centers.numpy(), strict=True))
+    for camera in rig:
+        (name,) = (name for name in found if camera["name"] in name)
+        np.testing.assert_allclose(found[name], -camera["R"].T @ camera["t"], atol=0.01)
+
+
+def test_a_rig_of_colmap_that_moves_is_refused(tmp_path):
+    rig = rig_of(3)
+    images = several_times(rig, "{camera}/{time:06d}", 2.0)
+    write_flat_images(tmp_path, images)
+    write_colmap(tmp_path, opencv(images), binary=False)
+    assert len(open_capture(tmp_path).cameras) == 9
+    lines = [f"{n} 1 1 0 0 0 0 0 0 3 CAMERA 1 {n} CAMERA 2 {n + 1} CAMERA 3 {n + 2}" for n in (1, 4, 7)]
+    (tmp_path / "sparse/0/frames.txt").write_text("# Frame list\n" + "\n".join(lines))
+    with pytest.raises(CaptureError, match=r"got 3 frames of a rig, frames\.txt, .*write one model for each frame"):
+        open_capture(tmp_path)
+
+
+@pytest.fixture
+def lying(tmp_path):
+    """A capture whose images are 40 x 32, with a folder to change."""
+    folder = tmp_path / "lying"
+    oblong = ring(3).cropped(0, 4, 48, 40)
+    write_capture(BallCapture(oblong), folder, images="jpeg")
+    return folder
+
+
+@pytest.mark.parametrize("orientation", [1, 5, 6, 7, 8])
+def test_masks_that_follow_exif_are_turned_back(lying, orientation):
+    expected = open_capture(lying).read(0).mask
+    undone = {5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270}
+    undone |= {7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_90}
+    for path in sorted(lying.glob("image/*/*.jpg")):
+        image = Image.open(path)
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        image.save(path, exif=exif, quality=95)
+    for path in sorted(lying.glob("mask/*/*.png")) if orientation > 1 else ():
+        Image.open(path).transpose(undone[orientation]).save(path)
+    assert (open_capture(lying).read(0).mask == expected).all()
+
+
+def test_masks_with_exif_of_their_own_are_turned(lying):
+    expected = open_capture(lying).read(0).mask
+    for path in sorted(lying.glob("mask/*/*.png")):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.open(path).transpose(Image.Transpose.ROTATE_90).save(path, exif=exif)
+    assert (open_capture(lying).read(0).mask == expected).all()
+
+
+def test_a_mask_that_is_turned_without_exif_is_named(lying):
+    for path in sorted(lying.glob("mask/*/*.png")):
+        Image.open(path).transpose(Image.Transpose.ROTATE_90).save(path)
+    with pytest.raises(CaptureError, match="mask is turned by 90 degrees and the image is not"):
+        open_capture(lying).read(0)
