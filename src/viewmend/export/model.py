@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
 from viewmend import __version__
@@ -18,28 +19,30 @@ from viewmend.models.views.model import ViewSynthNet
 from viewmend.utils.atomic_writes import write_atomically
 
 SMALLEST_PX = 64
-"""Shortest side of views and images."""
-MOST_CAMERAS = 64
+"""Views and images have at least this many pixels along a side."""
+MAX_CAMERAS = 64
+"""A rig has at most this many cameras."""
 EXAMPLE = {"height": 70, "width": 66, "rows": 67, "columns": 73, "chosen": 3, "camera": 5}
 """Sizes of the tensors that the model is traced with: all different, so that none is traced as equal to another."""
 OPSET = 18
-"""Version of ONNX's operators."""
+"""The version of ONNX's operators."""
 DTYPES = {"Float": torch.float32, "Int": torch.int64, "UInt8": torch.uint8, "Bool": torch.bool}
-"""Types of the inputs, by their annotations."""
-INDUCTOR = {
+"""The types of the inputs, by their annotations."""
+INDUCTOR_OPTIONS = {
     "joint_graph_constant_folding": False,
     "layout_optimization": False,
     "cpp.dynamic_threads": True,
     "cpp.simdlen": 1,
 }
-"""Constant folding needs known sizes. With layout optimisation, convolutions of a batch of unknown size give wrong
-results (torch 2.13). The caller sets the number of threads. Vectorised kernels compile for minutes and gain little."""
+"""AOTInductor's options. Constant folding needs known sizes. With layout optimisation, convolutions of a batch of
+unknown size give wrong results (torch 2.13). The caller sets the number of threads. Vectorised kernels compile for
+minutes and gain little."""
 
 
 def sizes(net: ViewSynthNet) -> dict[str, tuple[int, int]]:
     """Smallest and largest value of each size that the inputs' annotations name."""
     pixels = dict.fromkeys(("height", "width", "rows", "columns"), (SMALLEST_PX, LARGEST_PX))
-    return pixels | {"chosen": (2, max(3, net.config.num_views)), "camera": (2, MOST_CAMERAS)}
+    return pixels | {"chosen": (2, max(3, net.config.num_views)), "camera": (2, MAX_CAMERAS)}
 
 
 def load_exportable(name: str) -> ViewSynthNet:
@@ -60,12 +63,14 @@ def load_exportable(name: str) -> ViewSynthNet:
 
 
 def trace(net: ViewSynthNet) -> ExportedProgram:
-    """Traces the model for all sizes, in float32 on the CPU."""
+    """Trace the model for all sizes, in float32 on the CPU."""
     ranges = {size: Dim(size, min=low, max=high) for size, (low, high) in sizes(net).items()}
-    example, dynamic = [], [{axis: ranges[size] for axis, size in own.items()} for own in _named_axes()]
+    dynamic = [{axis: ranges[size] for axis, size in axes.items()} for axes in _named_axes()]
+    example: list[Tensor] = []
     for kind in ViewInputs.__annotations__.values():
-        dtype, shape = DTYPES[kind.__name__.split("[")[0]], kind.dim_str.split()
-        example.append(torch.ones([EXAMPLE.get(size) or int(size) for size in shape], dtype=dtype))
+        dtype = DTYPES[kind.__name__.split("[")[0]]
+        shape = [EXAMPLE.get(size) or int(size) for size in kind.dim_str.split()]
+        example.append(torch.ones(shape, dtype=dtype))
     with torch.enable_grad(), _quiet():  # with gradients, layers do not use compiled loops
         return torch.export.export(
             ExportedModel(net).eval().requires_grad_(False),
@@ -116,7 +121,7 @@ def check_onnx() -> None:
 
 
 def write_pt2(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -> None:
-    """Compiles a program for this machine's processor, and writes it as an AOTInductor package with its metadata.
+    """Compile a program for this machine's processor, and write it as an AOTInductor package with its metadata.
 
     Raises:
         OSError: it cannot be written; then there is no file.
@@ -124,7 +129,7 @@ def write_pt2(program: ExportedProgram, path: Path, notes: Mapping[str, str]) ->
     from torch._inductor import aoti_compile_and_package
     from torch._inductor.utils import fresh_cache
 
-    configs = INDUCTOR | {"aot_inductor.metadata": dict(notes)}
+    configs = INDUCTOR_OPTIONS | {"aot_inductor.metadata": dict(notes)}
 
     def write(draft: Path) -> None:
         aoti_compile_and_package(program, package_path=str(draft), inductor_configs=configs)
@@ -134,7 +139,7 @@ def write_pt2(program: ExportedProgram, path: Path, notes: Mapping[str, str]) ->
 
 
 def write_onnx(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -> None:
-    """Writes a program as one ONNX file with its metadata.
+    """Write a program as one ONNX file with its metadata.
 
     Raises:
         OSError: it cannot be written; then there is no file.
@@ -163,7 +168,7 @@ FORMATS: dict[str, tuple[Callable[[], None], Callable[[ExportedProgram, Path, Ma
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Hides torch's warnings about deprecations and optional packages."""
+    """Hide torch's warnings about deprecations and optional packages."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

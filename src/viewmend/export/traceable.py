@@ -25,6 +25,19 @@ from viewmend.models.views.pyramids import AREA_LEVEL, SMALLEST_PX, MipLevels, S
 from viewmend.models.views.ray_fill import gather_ray_inputs
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
+LARGEST_PX = 4096
+"""Images and views have at most this many pixels along a side."""
+LEVELS = 11
+"""An image pyramid has this many levels: enough for a shorter side of `LARGEST_PX`."""
+CONSTANT = 5
+"""From this level on, the canvases of an image pyramid have the same size for all images: 130 pixels."""
+SPARE = 16
+"""The sheet of `_packed` has this many rows more than the finest level, for the borders of the levels next to it."""
+FILL_LEVELS = 12
+"""The smooth fill halves a view this many times, until one pixel is left."""
+FILL_CONSTANT = 3
+"""From this level on, the canvases of the smooth fill have the same size for all views."""
+
 
 class ViewInputs(NamedTuple):
     """A rendered view, the rig, and the choice of source cameras: the exported model's inputs, in this order.
@@ -85,9 +98,13 @@ class ViewInputs(NamedTuple):
                 f"expected a view that names at least two cameras with a frame, got {chosen}; give source_views and "
                 "candidate_views"
             )
-        frame, weights = seen.frame, dict(zip(view.source_views, view.weights, strict=True))
+        frame = seen.frame
+        weights = dict(zip(view.source_views, view.weights, strict=True))
         return cls(
-            *(view.rgb, view.mask, view.error, view.depth),
+            rgb=view.rgb,
+            mask=view.mask,
+            error=view.error,
+            depth=view.depth,
             weights=torch.stack([weights.get(name, torch.zeros_like(view.mask)) for name in chosen]),
             K=view.camera.K[0],
             camera_from_world=view.camera.camera_from_world[0],
@@ -122,18 +139,6 @@ class ViewOutputs(NamedTuple):
     """z-depth of the subject, metres; 0 where there is none."""
 
 
-LARGEST_PX = 4096
-"""Longest side of images and views."""
-LEVELS = 11
-"""Scales of an image: enough for a shorter side of `LARGEST_PX`."""
-CONSTANT = 5
-"""First level whose canvas is as large for all images: 130 pixels."""
-SPARE = 16
-"""Rows of `_packed` beyond the finest level's: its other levels add up to that height, but for their borders."""
-FILL_LEVELS, FILL_CONSTANT = 12, 3
-"""The same of the smooth fill, which halves a view until one pixel is left."""
-
-
 class ExportedModel(nn.Module):
     """`ViewSynthNet.step` of one view, without removing `remains_of_phantoms`."""
 
@@ -144,7 +149,8 @@ class ExportedModel(nn.Module):
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """`ViewOutputs` of `ViewInputs`."""
         inputs = ViewInputs(*tensors)
-        view, sources = inputs.view, PackedSources.of_inputs(inputs)
+        view = inputs.view
+        sources = PackedSources.of_inputs(inputs)
         where = view.refine_mask & (rim_depth(view.depth) > 0)
         guess = self._guess(view, sources)
         prediction = self.net(view, sources, where=where, guess=guess)
@@ -189,12 +195,13 @@ class PackedSources(SourceCameras):
 
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
         """`SourceCameras.mips`."""
-        parts = (self.images, self.cameras, 3), (self.silhouettes.mask[:, None], self.silhouettes.cameras, 0)
-        found = []
-        for images, cameras, mask in parts:
-            packed = PackedPyramids.of(images.float(), cameras.size_px, mask)
-            found += map(packed.at, choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale))
-        return found
+        images = PackedPyramids.of(self.images.float(), self.cameras.size_px, mask=3)
+        masks = PackedPyramids.of(self.silhouettes.mask[:, None].float(), self.silhouettes.cameras.size_px, mask=0)
+        mips: list[MipLevels] = []
+        for packed, cameras in ((images, self.cameras), (masks, self.silhouettes.cameras)):
+            levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
+            mips += [packed.at(level) for level in levels]
+        return mips
 
 
 class PackedPyramids(NamedTuple):
@@ -236,21 +243,34 @@ def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
     The finest level and, below each other to its right, those before `CONSTANT` make one sheet; the others follow.
     """
-    finest, right, others = levels[0], levels[1:CONSTANT], levels[CONSTANT:]
-    height, width, half = finest.shape[2] + SPARE, finest.shape[3] + 1, right[0].shape[3] + 1
-    strips = [F.pad(level, (1, half - 1 - level.shape[3], 1, 0)) for level in right]
+    finest = levels[0]
+    right = levels[1:CONSTANT]
+    others = levels[CONSTANT:]
+
+    # the sheet: the finest level, and a strip of the following ones
+    height = finest.shape[2] + SPARE
+    width = finest.shape[3] + 1
+    strip_width = right[0].shape[3] + 1
+    strips = [F.pad(level, (1, strip_width - 1 - level.shape[3], 1, 0)) for level in right]
     below = height - sum(level.shape[2] for level in strips)
     left = F.pad(finest, (1, 0, 1, SPARE - 1))
     sheet = torch.cat([left, F.pad(torch.cat(strips, 2), (0, 0, 0, below))], 3)
+
+    # the other levels, row by row behind it
     rows = [F.pad(level, (1, 0, 1, 0)) for level in others]
     pixels = torch.cat([image.flatten(2) for image in (sheet, *rows)], 2).movedim(1, 2)
-    tops = torch.cat([torch.full((1,), size, dtype=torch.long) for size in (0, *(s.shape[2] for s in strips[:-1]))])
-    tops, columns = tops.cumsum(0), sheet.shape[3]
-    sizes = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
-    first = torch.zeros(1, dtype=torch.long), tops * columns + width, sizes + sheet.shape[2] * columns
-    all_columns = torch.full((CONSTANT,), columns, dtype=torch.long), torch.tensor([r.shape[3] for r in rows])
+
+    # where each level begins, and its row length and size
+    heights = [0, *(strip.shape[2] for strip in strips[:-1])]
+    tops = torch.cat([torch.full((1,), size, dtype=torch.long) for size in heights]).cumsum(0)
+    columns = sheet.shape[3]
+    areas = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
+    first_finest = torch.zeros(1, dtype=torch.long)
+    first = torch.cat([first_finest, tops * columns + width, areas + sheet.shape[2] * columns])
+    sheet_columns = torch.full((CONSTANT,), columns, dtype=torch.long)
+    row_columns = torch.tensor([row.shape[3] for row in rows])
     sides = [torch.cat([torch.full((1,), level.shape[axis] + 1) for level in levels]) for axis in (2, 3)]
-    return pixels, torch.cat(first), torch.cat(all_columns), torch.stack(sides, 1)
+    return pixels, first, torch.cat([sheet_columns, row_columns]), torch.stack(sides, 1)
 
 
 def halvings(
@@ -304,7 +324,8 @@ def pull_push_any_size(
     sizes = [(axis, (size + scale - 1) // scale) for axis, size in zip((1, 2), known.shape, strict=True)]
     filled = levels[-1][:-1]
     for level in range(FILL_LEVELS - 1, -1, -1):
-        colour, weight = levels[level][:-1], levels[level][-1:]
+        colour = levels[level][:-1]
+        weight = levels[level][-1:]
         for axis, size in sizes:
             filled = _interpolate(filled, axis, size[level + 1], size[level], colour.shape[axis])
         filled = torch.where(weight > 0, colour, filled)

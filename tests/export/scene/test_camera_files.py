@@ -12,7 +12,9 @@ import torch
 from pxr import Gf, Usd, UsdGeom
 from reference.ball import ring
 
-from viewmend.export.scene import blender_script, engine_from_world, usd_scene
+from viewmend.export.blender import blender_script
+from viewmend.export.engine_cameras import engine_from_world
+from viewmend.export.usd import usd_scene
 from viewmend.geometry.cameras import Cameras, project
 
 POINTS = torch.tensor([[0.1, 0.2, 0.3], [-0.3, 0.1, 0.0], [0.0, -0.2, 0.1]])

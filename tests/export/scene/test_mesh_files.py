@@ -6,7 +6,7 @@ import torch
 import trimesh
 from reference.ball import RADIUS_M, photograph, proxy, ring
 
-from viewmend.export.scene import write_glb, write_ply
+from viewmend.export.mesh_files import write_glb, write_ply
 from viewmend.rendering.proxy_views import vertex_colours
 from viewmend.types import ContextViews
 
