@@ -40,8 +40,8 @@ def draw_mode(
 
     rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. mended: Fhat. depth:
     from red (near) to blue, over `depth_range`. error: from black to yellow (`LARGE_ERROR`). coverage: the colours of
-    the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey if the inpainter
-    does not predict it. The others: as in `RenderResult.extra`.
+    the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey where the inpainter
+    does not predict it, or has not yet. The others: as in `RenderResult.extra`.
     """
     own = (extra or {})[mode] if mode in EXTRA_MODES else None
     if mode == "error" and own is not None:
@@ -63,10 +63,11 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
     if mode == "mended":
         return _to_8bit(completed.rgb)
     if mode == "confidence":
+        grey = completed.rgb.mean(0).expand(3, -1, -1)
         if completed.confidence is None:
-            return _to_8bit(completed.rgb.mean(0).expand(3, -1, -1))
-        heat = torch.from_numpy(heat_map(completed.confidence, "viridis"))
-        return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
+            return _to_8bit(grey)
+        heat = torch.from_numpy(heat_map(completed.confidence, "viridis")).movedim(-1, 0).to(completed.rgb) / 255
+        return _to_8bit(torch.where(view.refine_mask, heat * completed.opacity, grey))
     if mode == "depth":
         depth = view.cut_depth
         near, far = depth_range(depth)
@@ -87,10 +88,12 @@ def surface_depth(completed: CompletedView) -> Float[Tensor, "height width"]:
 
 
 def mean_confidence(completed: CompletedView) -> float | None:
-    """Mean confidence of the subject's pixels; None if the inpainter does not predict it."""
-    if completed.confidence is None:
+    """Mean confidence of the predicted pixels, weighted by their opacity; None if there are none."""
+    weight = completed.opacity * completed.view.refine_mask
+    total = float(weight.sum())
+    if completed.confidence is None or total == 0:
         return None
-    return round(float((completed.confidence * completed.opacity).sum() / completed.opacity.sum().clamp(min=1)), 4)
+    return round(float((completed.confidence * weight).sum()) / total, 4)
 
 
 def depth_range(depth: Float[Tensor, "height width"]) -> tuple[float, float]:
@@ -218,6 +221,7 @@ def encode_frame(
         "height": first.mask.shape[0],
         "cameras": [{k: c[k] for k in ("K", "R", "T")} for v in result.completed for c in cameras_json(v.view.camera)],
         "source_views": list(first.source_views),
+        "input_views": list(result.input_views or first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
         "confidence": mean_confidence(result.completed[0]),

@@ -73,6 +73,8 @@ class RenderResult:
     """Default background, as hexadecimal RGB: the model's own."""
     extra: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
     """Images by mode of `RenderRequest.extra_modes`, one mapping per eye: RGB in [0, 1], times alpha, and alpha."""
+    input_views: tuple[str, ...] = ()
+    """Names of the cameras that coloured or completed the first eye's view, those that coloured it first."""
     psnr_db: float | None = None
     """PSNR inside the true mask of `RenderRequest.truth`, of the model that was asked for."""
 
@@ -208,7 +210,18 @@ class Renderer:
         if truth is not None:
             background = inpainter.background or self._config.background
             psnr_db, extra[0]["error"] = self._score(scored, truth, background)
-        return RenderResult(request.time, tuple(completed), views[0].viewer, times, self.background, extra, psnr_db)
+        rendered = completed[0].view
+        is_predicted = request.quality.mend and request.quality.refine_fraction != 0
+        return RenderResult(
+            time=request.time,
+            completed=tuple(completed),
+            viewer=views[0].viewer,
+            times=times,
+            background=self.background,
+            extra=extra,
+            input_views=self._inpainter.source_names(rendered) if is_predicted else rendered.source_views,
+            psnr_db=psnr_db,
+        )
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
         """Those of these names that are cameras of the rig, in its order; ValueError if fewer than two are left."""

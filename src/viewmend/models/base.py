@@ -290,6 +290,10 @@ class Inpainter:
         """
         return None
 
+    def source_names(self, view: IncompleteView) -> tuple[str, ...]:
+        """Names of the cameras whose images complete a view; by default those that coloured it."""
+        return view.source_views
+
     def encode_history(self, view: IncompleteView, context: ContextProvider) -> None:
         """Encode what `step` would need of the frames before `view`, as if they had been streamed."""
 

@@ -7,6 +7,7 @@ BIG, SMALL = 0.5, 0.2
 CAMERAS = 4
 COLOURS = [[230, 120, 60], [70, 150, 230]]
 SOURCES = ["cam00", "cam01"]
+INPUTS = ["cam00", "cam01", "cam02"]
 PINK = (255, 38, 140)
 CLAY = (219, 212, 201)
 FRAMES = 40

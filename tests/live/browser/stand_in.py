@@ -79,7 +79,7 @@ class StandIn:
         self.files = page_files()
         routes = [Route("/", self._file), Route("/page/{name:path}", self._file)]
         routes += [Route("/path", self._progress), Route("/camera.jpg", self._original)]
-        routes += [Route("/turntable", self._turntable)]
+        routes += [Route("/turntable", self._turntable), Route("/frame.jpg", self._scored)]
         routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
         config = uvicorn.Config(
             Starlette(routes=routes), port=0, log_config=None, log_level="error", ws="websockets-sansio", lifespan="off"
@@ -135,6 +135,12 @@ class StandIn:
         self.originals.append(asked)
         image = scene.original(asked["name"], int(asked["time"]))
         return Response(cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg")
+
+    async def _scored(self, request: Request) -> Response:
+        asked = dict(request.query_params)
+        image = scene.original(asked["camera"], int(asked["time"]))
+        content = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
+        return Response(content, media_type="image/jpeg", headers={"X-Viewmend-PSNR": "25.0"})
 
     async def _viewer(self, socket: WebSocket) -> None:
         await socket.accept()
@@ -227,7 +233,13 @@ class StandIn:
                 data.append(content)
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
         header |= {"height": height, "full": part == 1.0, "cameras": cameras, "holes": share}
-        header |= {"source_views": scene.SOURCES, "top_k": look.get("top_k"), "context_times": 3, "dropped": 0}
+        header |= {
+            "source_views": scene.SOURCES,
+            "input_views": scene.INPUTS,
+            "top_k": look.get("top_k"),
+            "context_times": 3,
+            "dropped": 0,
+        }
         header |= {"colours": scene.COLOURS, "confidence": self.confidence}
         stages = {"geometry": 8.0, "context": 4.0, "rendering": 6.0, "encode": 2.0}
         stages["inpainting"] = 30.0 + 10 * np.sin(now)

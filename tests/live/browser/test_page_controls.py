@@ -224,8 +224,8 @@ def test_the_rig_is_drawn_and_the_cameras_in_use_stand_out(view):
     assert view.page.locator("#labels button", has_text="cam").count() == scene.CAMERAS
     view.tab("cameras")
     used = view.page.locator("#cameras button[data-used]").all_inner_texts()
-    assert used == scene.SOURCES
-    assert view.page.locator("#camera-count").inner_text() == "2 of 4 used for this view"
+    assert used == scene.INPUTS
+    assert view.page.locator("#camera-count").inner_text() == "3 of 4 used for this view"
     view.page.locator("#rig").set_checked(False)
     view.settle()
     assert view.page.locator("#labels").is_hidden()

@@ -14,12 +14,13 @@ import { CameraList } from "./ui/cameras.js";
 import { buildControls } from "./ui/controls.js";
 import { byId } from "./ui/dom.js";
 import { Layout } from "./ui/layout.js";
-import { MODES, buildModes, offerModels, placeDivider } from "./ui/modes.js";
+import { MODES, buildModes, nameSides, offerModels, placeDivider } from "./ui/modes.js";
 import { Original } from "./ui/original.js";
 import { showScale } from "./ui/scale.js";
 import { Notices } from "./ui/notices.js";
 import { OnAir } from "./ui/on_air.js";
 import { PathPanel } from "./ui/paths.js";
+import { Refining } from "./ui/refining.js";
 import { Statistics } from "./ui/statistics.js";
 import { buildTools, screenshot } from "./ui/tools.js";
 import { Transport } from "./ui/transport.js";
@@ -57,7 +58,8 @@ class Page {
     this.drawn = null;
     this.notices = new Notices(() => this.connection.open());
     this.onAir = new OnAir(this.link, this.notices, token);
-    this.statistics = new Statistics();
+    this.refining = new Refining();
+    this.statistics = new Statistics(() => this.motion.moving || (this.transport.playing && this.transport.shown >= 0));
     this.transport = new Transport(this.link, timeOf(query.get("time")));
     this.place = new Place();
     this.motion.first = poseOf(query.get("pose"));
@@ -209,10 +211,11 @@ class Page {
   take(shown) {
     const { header } = shown;
     this.stage.take(shown);
-    if (!this.drawing) this.showSources(header.source_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
+    if (!this.drawing) this.showSources(header.input_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
     if (!this.drawing) this.transport.picture(header.time);
     this.controls.size(header);
-    this.notices.arrived(this.settings.modes.includes("confidence") && header.confidence === null);
+    this.notices.arrived(this.settings.modes.includes("confidence") && header.full && header.confidence === null);
+    if (header.full) this.refining.finish();
     this.paint();
     const latency = this.statistics.picture(header, shown.bytes);
     Object.assign(this.canvas.dataset, { frame: header.frame, look: header.look, time: header.time, full: header.full });
@@ -284,8 +287,10 @@ class Page {
     if (!chosen) return;
     this.drawn = assets.shown = chosen;
     const shape = /** @type {import("./link/assets.js").Shape} */ (chosen.shape);
-    const sources = rankedCameras(shape, eye).slice(0, shape.header.blend.cameras);
-    this.showSources(sources.map((/** @type {number} */ n) => shape.header.cameras[n].name), undefined);
+    const blended = rankedCameras(shape, eye).slice(0, shape.header.blend.cameras);
+    const names = blended.map((/** @type {number} */ n) => shape.header.cameras[n].name);
+    const completes = this.stage.taken.shown > 0 && this.stage.header; // the server's picture covers the drawn one
+    this.showSources(completes ? this.stage.header.input_views : names, undefined);
     transport.picture(chosen.time);
     this.notices.arrived(false);
     this.canvas.dataset.drawn = String(chosen.time);
@@ -295,6 +300,7 @@ class Page {
   ask() {
     if (!this.motion.pose || this.headset.session) return;
     const { drawing } = this;
+    if (this.motion.moving || this.transport.playing) this.refining.stop();
     if (drawing && (this.motion.moving || this.transport.playing || !this.drawn)) {
       this.link.rest();
       this.canvas.dataset.full = "false";
@@ -308,7 +314,10 @@ class Page {
     const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, side, this.limits);
     const { fx, fy, cx, cy } = resize(lens, size.width, size.height);
     const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving, ...(drawing ? { full: true, depth: false } : {}) };
-    if (this.link.look(look) && !drawing) this.notices.asked();
+    if (this.link.look(look)) {
+      if (!drawing) this.notices.asked();
+      if (!moving && !this.transport.playing) this.refining.begin();
+    }
     if (!moving) this.tell();
   }
 
@@ -349,6 +358,7 @@ class Page {
     const viewport = [box.left, height - box.top - box.height, box.width, box.height].map((value) => Math.round(value * ratio));
     this.stage.clear(this.settings.ground);
     this.stage.draw(viewer, viewport, this.wish(divider));
+    nameSides(this.settings, (mode) => this.stage.shownMode(viewer, mode));
     this.cameras.place(this.settings.get("rig"), viewer, box);
     this.compare();
     this.statistics.painted(this.drawing && this.drawn ? this.stage.scene.cost : null);

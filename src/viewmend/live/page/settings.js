@@ -52,7 +52,8 @@ const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidenc
 export const COMPARED = /^(compared:[\w.-]+|original|error)$/;
 /** The mode that the server knows, or the page's own. @param {string} value */
 export const modeOf = (value) => value.split(":")[0];
-const HERE = ["original", "error"];
+/** Images that exist only at a camera; elsewhere, their side shows the completed view. */
+export const AT_CAMERA = ["original", "error"];
 /** What a choice may be, where not everything is one. @type {Record<string, (value: string) => boolean>} */
 const SENSIBLE = {
   mode: (value) => value === "split" || PICTURES.includes(value),
@@ -127,8 +128,7 @@ export class Settings extends EventTarget {
 
   /** The modes that the server must render. @returns {string[]} */
   get modes() {
-    const asked = [...new Set(this.shown.map(modeOf))].filter((mode) => !HERE.includes(mode));
-    return asked.length ? asked : ["mended"];
+    return [...new Set(this.shown.map((value) => (AT_CAMERA.includes(value) ? "mended" : modeOf(value))))];
   }
 
   /** What is shown, from left to right. @returns {string[]} */

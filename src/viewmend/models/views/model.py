@@ -199,6 +199,10 @@ class ViewSynthNet(Network):
             return fill(view.rgb, view.holes, view.mask > 0)
         return self.coarse(replace(view, error=view.holes.to(view.error)), sources).float()
 
+    def source_names(self, view: IncompleteView) -> tuple[str, ...]:
+        """Names of the cameras that rays are sampled in, the closest first."""
+        return view.closest_views(self.config.num_views)
+
     @torch.no_grad()
     @light_operations()
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:

@@ -165,8 +165,9 @@ export class Stage {
       for (const { mode, until } of wish.parts) {
         const [from, to] = [Math.round(start * width), Math.round(until * width)];
         gl.scissor(x + from, y, Math.max(0, to - from), height);
-        if (mode in this.photos) this.#photo(viewer, mode);
-        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(mode) ? mode : kept.modes[0]], wish, eye);
+        const shown = this.shownMode(viewer, mode);
+        if (shown in this.photos) this.#photo(viewer, shown);
+        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(shown) ? shown : kept.modes[0]], wish, eye);
         start = until;
       }
       gl.scissor(x, y, width, height);
@@ -192,7 +193,8 @@ export class Stage {
     gl.scissor(x, y, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     let start = 0;
-    for (const { mode, until } of wish.parts) {
+    for (const { mode: wanted, until } of wish.parts) {
+      const mode = this.shownMode(viewer, wanted);
       const [from, to] = [Math.round(start * width), Math.round(until * width)];
       gl.scissor(x + from, y, Math.max(0, to - from), height);
       const over = kept?.modes.includes(mode) ? opacity : 0;
@@ -230,14 +232,21 @@ export class Stage {
     gl.drawElements(gl.TRIANGLES, quad.solid, gl.UNSIGNED_INT, 0);
   }
 
-  /** A camera's image, where the view is at that camera. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */
+  /** What is drawn for a mode: the completed view in place of an image that does not exist at this pose. @param {Viewpoint & {distance?: number}} viewer @param {string} mode @returns {string} */
+  shownMode(viewer, mode) {
+    if (!(mode in this.photos)) return mode;
+    const photo = this.photos[mode];
+    if (!photo) return "mended";
+    const offset = length(sub(eyeOfCamera(viewer), photo.camera.center));
+    return offset > AT_CAMERA * (viewer.distance ?? 1) ? "mended" : mode;
+  }
+
+  /** A camera's image. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */
   #photo(viewer, mode) {
     const { gl } = this;
     const photo = this.photos[mode];
     if (!photo) return;
     const { camera, picture, quad } = photo;
-    const distance = viewer.distance ?? 1;
-    if (length(sub(eyeOfCamera(viewer), camera.center)) > AT_CAMERA * distance) return;
     gl.disable(gl.DEPTH_TEST);
     this.#image(camera, picture, quad, this.#clip(camera, viewer, {}));
     gl.enable(gl.DEPTH_TEST);

@@ -11,6 +11,7 @@
  * @property {boolean} full
  * @property {{K: number[], R: number[], T: number[]}[]} cameras
  * @property {string[]} source_views
+ * @property {string[]} input_views
  * @property {number[][]} [colours]
  * @property {number} holes
  * @property {Record<string, number>} stage_ms

@@ -2,6 +2,7 @@
 
 import { project } from "../draw/projection.js";
 import { byId, element } from "./dom.js";
+import { AT_CAMERA } from "../settings.js";
 
 /** @param {number[]} colour */
 const css = (colour) => `rgb(${colour.map(Math.round).join(" ")})`;
@@ -19,6 +20,8 @@ export class CameraList {
     this.cameras = [];
     this.last = -1;
     this.used = "";
+    /** What was shown before a camera was left out; null if nothing else was. @type {{mode: string, left: string, right: string} | null} */
+    this.before = null;
     settings.watch(["without"], () => this.#inputs());
   }
 
@@ -43,12 +46,30 @@ export class CameraList {
     if (!this.here || byId("input").disabled) return;
     const { settings, here: { name } } = this;
     const without = settings.without;
-    const leaves = !without.includes(name);
-    settings.set("without", (leaves ? [...without, name] : without.filter((/** @type {string} */ other) => other !== name)).join(","));
-    if (!leaves || settings.shown.includes("original") || settings.shown.includes("error")) return;
+    const leavesOut = !without.includes(name);
+    const others = without.filter((/** @type {string} */ other) => other !== name);
+    settings.set("without", (leavesOut ? [...without, name] : others).join(","));
+    if (!leavesOut) this.#endComparison();
+    else if (!settings.shown.some((value) => AT_CAMERA.includes(value))) this.#beginComparison();
+  }
+
+  /** Compare the view with the camera's image. */
+  #beginComparison() {
+    const { settings } = this;
+    this.before = { mode: settings.get("mode"), left: settings.get("left"), right: settings.get("right") };
     settings.set("left", "mended");
     settings.set("right", "original");
     settings.set("mode", "split");
+  }
+
+  /** Return to what was shown before the comparison, unless something else was chosen since. */
+  #endComparison() {
+    const { settings, before } = this;
+    this.before = null;
+    if (!before || settings.get("mode") !== "split" || settings.get("right") !== "original") return;
+    settings.set("mode", before.mode);
+    settings.set("left", before.left);
+    settings.set("right", before.right);
   }
 
   /** @param {any} camera the one that the view is at; null for none */

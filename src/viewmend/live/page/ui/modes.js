@@ -91,6 +91,20 @@ function buildDivider(settings) {
 }
 
 /**
+ * Name both sides of the divider by what they show.
+ * @param {Settings} settings @param {(mode: string) => string} shownMode what is drawn for a mode at this pose
+ */
+export function nameSides(settings, shownMode) {
+  for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
+    const wanted = settings.get(side);
+    const isThere = shownMode(modeOf(wanted)) === modeOf(wanted);
+    const text = isThere ? nameOf(wanted) : `${nameOf("mended")} (${nameOf(wanted).toLowerCase()}: only at a camera)`;
+    const label = byId(`${side}-name`);
+    if (label.textContent !== text) label.textContent = text;
+  }
+}
+
+/**
  * Put the divider and the two names where they belong.
  * @param {Settings} settings @param {import("../view/lens.js").Box} free @returns {number} the divider's x, CSS pixels
  */

@@ -38,7 +38,9 @@ class Rate {
 }
 
 export class Statistics {
-  constructor() {
+  /** @param {() => boolean} active whether the view moves or plays: a frame rate means nothing at rest */
+  constructor(active) {
+    this.active = active;
     this.pictures = new Rate();
     this.repaints = new Rate();
     this.drawn = new Rate();
@@ -109,7 +111,7 @@ export class Statistics {
     const median = quantile(this.latencies, 0.5);
     const fps = Math.round((cost ? this.drawn : this.pictures).perSecond);
     const late = !cost && median > 0 ? [`${median.toFixed(0)} ms`] : [];
-    byId("readout").textContent = [...(fps ? [`${fps} fps`] : []), ...late].join(" · ");
+    byId("readout").textContent = this.active() ? [...(fps ? [`${fps} fps`] : []), ...late].join(" · ") : "";
     if (!this.header) return;
     if (!byId("section-stats").offsetParent) return;
     const { figures, header, server } = this;
