@@ -160,7 +160,8 @@ def cache_frame(
     device = frame.rgb.device
     start = now_s(device)
     masks = _joined(Silhouettes(frame.mask, frame.cameras), carving)
-    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, bounds, config))
+    own_bounds = None if bounds is None else bounds.to(device)
+    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, own_bounds, config))
     return CachedFrame(frame, proxy, ms_since(start, device))
 
 

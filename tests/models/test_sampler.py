@@ -21,11 +21,13 @@ from viewmend.models.views.pyramids import (
 from viewmend.models.views.ray_fill import OFFSETS as FILL_OFFSETS
 from viewmend.models.views.ray_fill import sample_behind_proxy
 from viewmend.models.views.sampler import (
+    CAMERA_CHANNELS,
     PATCH,
     CameraFeatures,
     Projections,
     Rays,
     RaySamples,
+    choose_cameras,
     sample_level,
     sample_level_cubic,
     sample_rays,
@@ -186,3 +188,53 @@ def test_the_compiled_loop_equals_pytorch(samples, own_prior):
     torch.testing.assert_close(fast.trust.sum(2), seen.amax(2), atol=1e-5, rtol=0)
     mean = (fast.trust[..., None] * samples.features).sum(2)
     torch.testing.assert_close(torch.cat([fast.colour, fast.mask], -1), mean[..., :4])
+
+
+def some_cameras(rays, cameras: int, count: int):
+    """Indices of cameras for each ray, drawn at random."""
+    rng = torch.Generator().manual_seed(3)
+    return torch.rand(len(rays.uv_px), cameras, generator=rng).argsort(1)[:, :count].contiguous()
+
+
+@pytest.mark.parametrize("cubic", [False, True])
+@pytest.mark.parametrize("kernels", [True, False])
+def test_rays_are_sampled_in_their_own_cameras_only(scene, kernels, cubic):
+    _, view, sources = scene
+    sample = sample_rays if kernels else sample_rays_torch
+    rays = rays_of(view)
+    chosen = some_cameras(rays, len(sources.cameras), 2)
+    everything = sample(rays, sources, 2.0, cubic)
+    found = sample(rays._replace(cameras=chosen), sources, 2.0, cubic)
+    index = chosen[:, None, :, None].expand(-1, len(OFFSETS), -1, sum(CAMERA_CHANNELS))
+    features = everything.features[..., : sum(CAMERA_CHANNELS)].gather(2, index)
+    torch.testing.assert_close(found.features[..., : sum(CAMERA_CHANNELS)], features, atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.statistics[..., 6:], everything.statistics[..., 6:], atol=1e-6, rtol=0)
+    seen = found.features[..., IN_VIEW].amax(2)
+    torch.testing.assert_close(found.prior.sum(2), seen, atol=1e-3, rtol=0)
+    parts = [sample(part, sources, 2.0, cubic) for part in rays._replace(cameras=chosen).split(700)]
+    assert torch.equal(torch.cat([part.features for part in parts]), found.features)
+
+
+def test_a_camera_that_does_not_exist_sees_nothing(scene):
+    _, view, sources = scene
+    rays = rays_of(view)
+    chosen = some_cameras(rays, len(sources.cameras), 2)
+    absent = torch.cat([chosen, torch.full_like(chosen[:, :1], len(sources.cameras))], 1)
+    wanted = sample_rays_torch(rays._replace(cameras=chosen), sources, 2.0)
+    found = sample_rays_torch(rays._replace(cameras=absent), sources, 2.0)
+    assert torch.equal(found.statistics, wanted.statistics) and not bool(found.features[:, :, 2].any())
+
+
+@pytest.mark.parametrize("kernels", [True, False])
+def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
+    _, view, sources = scene
+    monkeypatch.setattr(SourceCameras, "use_kernels", kernels)
+    rays = rays_of(view)
+    features = CameraFeatures.unstack(sample_rays_torch(rays, sources, 2.0).features[..., : sum(CAMERA_CHANNELS)])
+    weight = (4 * features.viewing_cosine).exp() / (1 + (6 * features.depth_difference).exp())
+    scores = (features.in_view * weight).sum((1, 3))
+    chosen = choose_cameras(rays, sources, 2)
+    own, others = (scores.gather(1, index) for index in (chosen, scores.argsort(1, descending=True)[:, :2]))
+    torch.testing.assert_close(own, others, atol=1e-2, rtol=1e-3)
+    assert len(chosen.unique(dim=0)) > 3, "they depend on the ray"
+    assert choose_cameras(rays, sources, len(sources.cameras)) is None

@@ -7,7 +7,7 @@ import torch
 
 from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider, RenderQuality, State
-from viewmend.models.views import prediction, pyramids
+from viewmend.models.views import model, prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
@@ -95,6 +95,23 @@ def test_chunks_of_rays_give_the_same(scene, monkeypatch):
     whole = stream.inpainter(view, sources)
     monkeypatch.setattr(pyramids, "CPU_RAYS", 29)
     torch.testing.assert_close(stream.inpainter(view, sources).rgb, whole.rgb, atol=1e-5, rtol=0)
+
+
+def test_all_implementations_predict_the_same_from_the_cameras_chosen_for_each_ray(scene, monkeypatch):
+    """Compiled kernels, PyTorch with gradients, and PyTorch alone."""
+    stream, view, sources = scene
+    monkeypatch.setattr(model, "RAY_VIEWS", 2)
+    with torch.no_grad():
+        fast = stream.inpainter(view, sources)
+        monkeypatch.setattr(SourceCameras, "use_kernels", False)
+        plain = stream.inpainter(view, sources)
+    monkeypatch.undo()
+    monkeypatch.setattr(model, "RAY_VIEWS", 2)
+    trained = stream.inpainter(view, sources)
+    assert fast.distribution.cameras.shape == (len(fast.distribution.cells), 2)
+    assert fast.trust.shape == (len(fast.pixels), 2)
+    for other in (plain, trained):
+        assert float((other.rgb.detach() - fast.rgb).abs().amax(1).quantile(0.99)) < 1e-3
 
 
 @pytest.mark.parametrize("values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}])

@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 import torch
-from reference.other_device import DEVICE, other_device
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
+from training.other_device import DEVICE, other_device
 
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import project, unproject
@@ -249,7 +249,10 @@ def test_each_term_alone_can_be_minimised(view, term):
     assert min(losses) < losses[0] - 0.02 * abs(losses[0]), losses
 
 
-def test_steps_are_made_on_any_device(view, monkeypatch):
+@pytest.mark.parametrize("ray_views", [2, 4])
+def test_steps_are_made_on_any_device(view, ray_views, monkeypatch):
+    """Also with more cameras than are sampled on a ray."""
+    monkeypatch.setattr("viewmend.models.views.model.RAY_VIEWS", ray_views)
     monkeypatch.setattr("viewmend.training.views.SPARSE", 1.0)  # of selected pixels
     losses = []
     for device in ("cpu", DEVICE):

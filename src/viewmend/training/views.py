@@ -332,6 +332,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
         depth = -_masked_mean((1 - part) * lower_log + part * upper_log, known)
         seen = visible_cameras(crop, made, z)
         nearest = upper - (part < 0.5).long()
+        if distribution.cameras is not None:
+            seen = seen.gather(1, distribution.cameras)
         trust = distribution.samples.trust[torch.arange(len(nearest)), nearest]
         visibility = -_masked_mean(((trust * seen).sum(1) + 1e-3).log(), known & seen.any(1))
         return total + weights.depth * depth + weights.visibility * visibility

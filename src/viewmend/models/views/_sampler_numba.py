@@ -67,6 +67,15 @@ def average_boxes(image, first, step, side, out):
 
 
 @inlined
+def _position(chosen, camera):
+    """Where a camera is among the chosen ones of a ray; -1 if it is not."""
+    for view in range(chosen.shape[0]):
+        if chosen[view] == camera:
+            return view
+    return -1
+
+
+@inlined
 def _project(per_metre, start, t, size):
     """Pixel and z-depth in a camera of a sample at z-depth t, and whether it is in view."""
     z = per_metre[2] * t + start[2]
@@ -159,19 +168,22 @@ def _covered_depth(depth, u, v):
 
 @kernel
 def sample_camera(
-    first, end, view, z, directions, per_metre, start, offset, size, images, scales, depth, size_m, is_source,
+    first, end, camera, chosen, z, directions, per_metre, start, offset, size, images, scales, depth, size_m, is_source,
     min_coverage, cubic, out, prior,
 ):  # fmt: skip
     """`CameraFeatures` of the samples on rays first to end - 1 in one camera, and prior weights, not normalised.
 
-    `cubic` applies to colour and mask. With a `min_coverage` above 0, distances behind the proxy are those of
-    `RayFill`, and there are no prior weights.
+    Only the rays are sampled that have this camera among their `chosen` ones. `cubic` applies to colour and mask. With
+    a `min_coverage` above 0, distances behind the proxy are those of `RayFill`, and there are no prior weights.
     """
     fine, wide, shapes = images
     per_near = 1 / (NEAR * size_m)
     per_far = 1 / (FAR * size_m)
     extent = np.float32(size[0]), np.float32(size[1])
     for ray in range(first, end):
+        view = _position(chosen[ray], camera)
+        if view < 0:
+            continue
         for sample in range(z.shape[1]):
             t = z[ray, sample]
             u, v, w, in_view = _project(per_metre[ray], start, t, extent)
@@ -206,6 +218,22 @@ def sample_camera(
 
 
 @kernel
+def score_camera(first, end, z, directions, per_metre, start, offset, size, depth, size_m, scores):
+    """Adds up prior weights, not normalised, of the samples on rays first to end - 1 in one camera."""
+    per_near = 1 / (NEAR * size_m)
+    extent = np.float32(size[0]), np.float32(size[1])
+    for ray in range(first, end):
+        for sample in range(z.shape[1]):
+            t = z[ray, sample]
+            u, v, w, in_view = _project(per_metre[ray], start, t, extent)
+            if in_view:
+                surface = depth[min(int(v), size[1] - 1), min(int(u), size[0] - 1)]
+                behind = (w - surface) * per_near if surface > 0 else 0.0
+                cosine = _cosine(offset, directions[ray], t)
+                scores[ray] += exp(4 * cosine) / (1 + exp(6 * behind / (1 + abs(behind))))
+
+
+@kernel
 def compare_cameras(first, end, features, prior, statistics):
     """Normalises prior weights; writes means and variances of colours by them, and differences from the means."""
     samples, views = prior.shape[1:]
@@ -237,35 +265,42 @@ def _sample_mask(image, u, v, scale):
     """The only channel of an image with a border, as `_sample`."""
     x = u * scale + 0.5
     y = v * scale + 0.5
-    left = min(floor(x), image.shape[1] - 2)
-    top = min(floor(y), image.shape[0] - 2)
-    right = x - left
-    below = y - top
-    upper = (1 - right) * image[top, left, 0] + right * image[top, left + 1, 0]
-    lower = (1 - right) * image[top + 1, left, 0] + right * image[top + 1, left + 1, 0]
-    return (1 / 255) * ((1 - below) * upper + below * lower)
-
-
-@inlined
-def _keep_smallest(smallest, ray, sample, first, value):
-    """Inserts a value into the two smallest of a sample, in order."""
-    if value < smallest[ray, sample, first]:
-        smallest[ray, sample, first + 1] = smallest[ray, sample, first]
-        smallest[ray, sample, first] = value
-    elif value < smallest[ray, sample, first + 1]:
-        smallest[ray, sample, first + 1] = value
+    left = min(int(x), image.shape[1] - 2)
+    top = min(int(y), image.shape[0] - 2)
+    right = np.float32(x - left)
+    below = np.float32(y - top)
+    top_left = np.float32(image[top, left, 0])
+    low_left = np.float32(image[top + 1, left, 0])
+    upper = top_left + right * (np.float32(image[top, left + 1, 0]) - top_left)
+    lower = low_left + right * (np.float32(image[top + 1, left + 1, 0]) - low_left)
+    return np.float32(1 / 255) * (upper + below * (lower - upper))
 
 
 @kernel
 def compare_silhouette(first, end, z, per_metre, start, size, images, scales, smallest):
     """Lowers the two smallest masks, and the two smallest averaged masks, of samples that this camera has in view."""
-    extent = np.float32(size[0]), np.float32(size[1])
+    samples = z.shape[1]
+    width = np.float64(size[0])
+    height = np.float64(size[1])
+    u = np.empty(samples)
+    v = np.empty(samples)
     for ray in range(first, end):
-        for sample in range(z.shape[1]):
-            u, v, _, in_view = _project(per_metre[ray], start, z[ray, sample], extent)
-            if in_view:
-                _keep_smallest(smallest, ray, sample, 0, _sample_mask(images[0], u, v, scales[0]))
-                _keep_smallest(smallest, ray, sample, 2, _sample_mask(images[1], u, v, scales[1]))
+        for sample in range(samples):  # without branches, so that it is vectorised
+            t = np.float64(z[ray, sample])
+            depth = per_metre[ray, 2] * t + start[2]
+            front = (t > 0) & (depth > 1e-6)
+            inverse = 1 / (depth if front else 1.0)
+            u[sample] = (per_metre[ray, 0] * t + start[0]) * inverse if front else -1.0
+            v[sample] = (per_metre[ray, 1] * t + start[1]) * inverse
+        for sample in range(samples):
+            if u[sample] >= 0 and v[sample] >= 0 and u[sample] < width and v[sample] < height:
+                found = smallest[ray, sample]
+                mask = _sample_mask(images[0], u[sample], v[sample], scales[0])
+                mean = _sample_mask(images[1], u[sample], v[sample], scales[1])
+                found[1] = min(found[1], max(found[0], mask))
+                found[0] = min(found[0], mask)
+                found[3] = min(found[3], max(found[2], mean))
+                found[2] = min(found[2], mean)
 
 
 @kernel(fastmath={"reassoc", "contract", "nsz"})  # so that sums over features are vectorised

@@ -11,8 +11,8 @@ from viewmend.geometry.threads import heavy_operations, parallel_for
 from viewmend.models.views.config import COLOUR, CONTRAST, FEATURES, IN_VIEW, MASK, STATISTICS
 from viewmend.models.views.sampler import RaySamples
 
-BAND = 64
-"""A thread aggregates this many rays at a time."""
+BAND = 1024
+"""A thread aggregates about this many samples at a time."""
 
 
 class AggregatedSamples(NamedTuple):
@@ -92,11 +92,12 @@ class SampleAggregator(nn.Module):
                 trust,
             )
             arrays = [tensor.numpy() for tensor in tensors]
+            rays = -(-BAND // per_ray)
 
             def work(band: int) -> None:
-                aggregate(band * BAND, min(count, (band + 1) * BAND), bias, *arrays)
+                aggregate(band * rays, min(count, (band + 1) * rays), bias, *arrays)
 
-            parallel_for(work, -(-count // BAND))
+            parallel_for(work, -(-count // rays))
             out = self.sample(inputs)
         mean = inputs[..., len(weight) :]
         return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)

@@ -9,6 +9,8 @@ from viewmend.utils.untrusted_input import typed
 
 OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.19, 0.26, 0.36, 0.5)
 """The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes."""
+RAY_VIEWS = 4
+"""A ray is sampled in this many of the source cameras: those near the viewer that see the proxy's surface."""
 FEATURES = 18
 """A ray sample has this many features per camera: the 14 of `CameraFeatures`, RGB minus the cameras' mean, and the
 prior weight."""

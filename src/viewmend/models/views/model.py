@@ -2,11 +2,11 @@
 
     source cameras -> ray samples -> aggregation -> depth distribution -> blending -> prediction
 
-At half the resolution, samples at fixed offsets behind the proxy are taken from the source cameras along every ray and
-aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as networks on cost volumes
-do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the depth found, and blended. What blending
-softens comes back as two bands of detail, each from the blended colours, one camera or the rendered view, with a
-learned gain for every pixel.
+At half the resolution, samples at fixed offsets behind the proxy are taken along every ray, from the source cameras
+that see it best, and aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as
+networks on cost volumes do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the depth found, and
+blended. What blending softens comes back as two bands of detail, each from the blended colours, one camera or the
+rendered view, with a learned gain for every pixel.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregator
-from viewmend.models.views.config import COLOUR, FEATURES, MASK, OFFSETS, RaysConfig, ViewsConfig
+from viewmend.models.views.config import COLOUR, FEATURES, MASK, OFFSETS, RAY_VIEWS, RaysConfig, ViewsConfig
 from viewmend.models.views.error_predictor import ErrorPredictor, fallback_view
 from viewmend.models.views.grid import (
     BAND_PX,
@@ -49,7 +49,7 @@ from viewmend.models.views.prediction import (
 )
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.models.views.sampler import Rays, RayStatistics, sample_rays
+from viewmend.models.views.sampler import Rays, RayStatistics, choose_cameras, sample_rays
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
@@ -57,6 +57,8 @@ Mask = Bool[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
+CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
+"""The cameras of a cell are chosen by their prior weights at these z-depths behind the proxy, in subject sizes."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """A cell of the U-Net also has its relative depth, and whether it has a depth at all."""
 CANDIDATES = 4
@@ -259,12 +261,15 @@ class ViewSynthNet(Network):
         image: ViewImage,
     ) -> DepthDistribution:
         """Samples the cameras on the rays of all cells, and judges the samples by a U-Net over the view."""
-        # Cells with a pixel to predict, and the depth hypotheses on their rays
+        # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
         depth = nearest_depth(view.depth * predicted)
         cells = torch.nonzero(depth > 0)
         rows, columns = cells.unbind(1)
-        z_m = depth[rows, columns][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
-        rays = Rays(view, scale, CELL_PX * (cells.flip(1).double() + 0.5), z_m)
+        proxy_z = depth[rows, columns][:, None]
+        uv_px = CELL_PX * (cells.flip(1).double() + 0.5)
+        few = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(CHOOSING_OFFSETS))
+        cameras = choose_cameras(few, sources, RAY_VIEWS)
+        rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(OFFSETS), cameras)
 
         # Images of cells for the U-Net: the rendered view, and where the proxy is
         front = nearest_depth(view.depth)
@@ -280,7 +285,7 @@ class ViewSynthNet(Network):
             with heavy_operations():
                 features = self.unet.forward_points(inputs, cells, concatenate_channels(images.to(inputs)))
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
-        return DepthDistribution(cells, index_image(cells, depth.shape), depth, logits, samples, features)
+        return DepthDistribution(cells, index_image(cells, depth.shape), depth, logits, samples, cameras, features)
 
     def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
         """The aggregated samples of the rays of cells, chunk by chunk."""
@@ -304,7 +309,8 @@ class ViewSynthNet(Network):
         # Sample the cameras at the depth found
         stop_if_cancelled()
         surface = surface_points(view.depth, scale, pixels, distribution)
-        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, surface.depth.detach()[:, None])
+        cameras = None if distribution.cameras is None else distribution.cameras[surface.cell]
+        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, surface.depth.detach()[:, None], cameras)
         samples = sample_rays(rays, sources, step_px=1.0, cubic=True)
 
         # Weigh the cameras, beginning with the trust that they have in the pixel's cell

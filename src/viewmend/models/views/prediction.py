@@ -58,6 +58,8 @@ class DepthDistribution(NamedTuple):
     logits: Float[Tensor, "cell sample"]
     """Of the surface being at each depth hypothesis."""
     samples: AggregatedSamples
+    cameras: Int[Tensor, "cell view"] | None
+    """Indices of the source cameras that were sampled in each cell; None for all."""
     features: Float[Tensor, "1 feature rows columns"]
     """Output of the U-Net."""
 

@@ -100,6 +100,11 @@ class MipLevels(NamedTuple):
             scale=torch.ones_like(view, dtype=torch.double),
         )
 
+    def of_cameras(self, index: Int[Tensor, "ray chosen"]) -> "MipLevels":
+        """The levels of the cameras chosen for each ray: fields but `pixels` get the shape [ray, 1, chosen, ...]."""
+        at = index[:, None]
+        return MipLevels(self.pixels, self.first[at], self.columns[at], self.size[at], self.scale[at])
+
 
 def choose_levels(
     cameras: Cameras,

@@ -30,8 +30,8 @@ PATCH = 0.08
 """`RayFill` averages colours over squares of this side, in subject sizes: single pixels agree by chance."""
 MIN_COVERAGE = 0.3
 """`RayFill` measures the distance behind the proxy where at least this share of a pixel is covered by it."""
-BAND = 128
-"""A thread samples this many rays at a time."""
+BAND = 2048
+"""A thread takes about this many samples at a time."""
 
 
 class Rays(NamedTuple):
@@ -44,13 +44,19 @@ class Rays(NamedTuple):
     uv_px: Float[Tensor, "ray 2"]
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""
+    cameras: Int[Tensor, "ray view"] | None = None
+    """Indices of the source cameras that are sampled on each ray, or more if there are not enough; None for all."""
 
     def split(self, size: int | None) -> "list[Rays]":
         """Chunks of `size` rays; None gives one chunk."""
         if size is None:
             return [self]
-        parts = zip(self.uv_px.split(size), self.z_m.split(size), strict=True)
-        return [Rays(self.view, self.scale, uv_px, z_m) for uv_px, z_m in parts]
+        parts = []
+        for first in range(0, max(1, len(self.uv_px)), size):
+            own = slice(first, first + size)
+            cameras = None if self.cameras is None else self.cameras[own]
+            parts.append(self._replace(uv_px=self.uv_px[own], z_m=self.z_m[own], cameras=cameras))
+        return parts
 
     @property
     def origin(self) -> Float[Tensor, "3"]:
@@ -233,23 +239,27 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     """The reference of `sample_rays`."""
     fine, wide, outline, mean_outline = sources.mips(rays.view.camera, step_px, rays.scale)
 
-    # Distance behind the proxy: the depth of the nearest pixel
+    # Positions in the cameras, and distances behind the proxy there
     at = project_rays(rays, sources.cameras)
-    depth = sources.views.depth
-    rows, columns = depth.shape[1:]
-    first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
-    surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
-    behind = torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
+    behind = _distance_behind(rays, sources, at)
+    chosen = None
+    if rays.cameras is not None:
+        last = at.in_view.shape[2] - 1
+        chosen = rays.cameras.clamp_max(last)
+        at = Projections(*(_of_chosen(values, chosen) for values in at))
+        at = at._replace(in_view=at.in_view & (rays.cameras <= last)[:, None])
+        behind = _of_chosen(behind, chosen)
+        fine = fine.of_cameras(chosen)
+        wide = wide.of_cameras(chosen)
 
     # What each camera shows
     fine_values = sample_level_cubic(fine, at, 4) if cubic else sample_level(fine, at, 4)
     wide_values = sample_level(wide, at, 5)
-    stacked = _camera_features(rays, sources, at, fine_values, wide_values, behind, F.softsign)
+    stacked = _camera_features(rays, sources, at, fine_values, wide_values, behind, F.softsign, chosen)
     features = CameraFeatures.unstack(stacked)
 
     # Prior weights, and how the cameras differ by them
-    closeness = (4 * features.viewing_cosine).exp() / (1 + (6 * features.depth_difference).exp())
-    prior = features.in_view * closeness
+    prior = features.in_view * _closeness(features.viewing_cosine, features.depth_difference)
     prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
     mean = (prior * features.colour).sum(2)
     square = (prior * features.colour.square()).sum(2)
@@ -332,17 +342,66 @@ def _camera_features(
     wide: Float[Tensor, "ray sample view 5"],
     behind: Float[Tensor, "ray sample view"],
     squash: Callable[[Tensor], Tensor],
+    chosen: Int[Tensor, "ray view"] | None = None,
 ) -> Float[Tensor, "ray sample view 14"]:
     """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
+    cosines = viewing_cosines(rays, sources.cameras)
+    is_source = sources.is_source(rays.view.source_views).expand_as(cosines)
+    if chosen is not None:
+        cosines = _of_chosen(cosines, chosen)
+        is_source = _of_chosen(is_source, chosen)
     single_channels = [
         squash(behind / NEAR),
         squash(behind / FAR),
-        viewing_cosines(rays, sources.cameras),
-        sources.is_source(rays.view.source_views).expand_as(behind),
+        cosines,
+        is_source,
         torch.ones_like(behind),
     ]
     features = torch.cat([fine, torch.stack([channel.float() for channel in single_channels], -1), wide], -1)
     return torch.where(at.in_view[..., None], features, 0.0)
+
+
+def _distance_behind(rays: Rays, sources: SourceCameras, at: Projections) -> Float[Tensor, "ray sample view"]:
+    """Distance of samples behind the proxy, in subject sizes, by the depth of the nearest pixel in each camera."""
+    depth = sources.views.depth
+    rows, columns = depth.shape[1:]
+    first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
+    surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
+    return torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
+
+
+def _closeness(
+    cosine: Float[Tensor, "ray sample *view"], depth_difference: Float[Tensor, "ray sample *view"]
+) -> Float[Tensor, "ray sample *view"]:
+    """Prior weights, not normalised: high for cameras near the viewer that have the sample not far behind the proxy."""
+    return (4 * cosine).exp() / (1 + (6 * depth_difference).exp())
+
+
+def _of_chosen(
+    values: Shaped[Tensor, "ray sample camera"], chosen: Int[Tensor, "ray view"]
+) -> Shaped[Tensor, "ray sample view"]:
+    """The values of the cameras that were chosen for each ray."""
+    return values.gather(2, chosen[:, None].expand(-1, values.shape[1], -1))
+
+
+def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
+    """Indices of the `count` source cameras whose prior weights are highest on each ray; None if there are no more.
+
+    The weights are added up over the samples of the rays.
+    """
+    if torch.compiler.is_exporting():  # of any number of cameras
+        return F.pad(score_cameras_torch(rays, sources), (0, count), value=-1.0).topk(count, 1).indices
+    if len(sources.cameras) <= count:
+        return None
+    scores = _score_numba(rays, sources) if sources.use_kernels else score_cameras_torch(rays, sources)
+    return scores.topk(count, 1).indices
+
+
+def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
+    """The reference of the scores of `choose_cameras`."""
+    at = project_rays(rays, sources.cameras)
+    near = F.softsign(_distance_behind(rays, sources, at) / NEAR)
+    return (at.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
 
 
 def project_lines(rays: Rays, cameras: Cameras) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
@@ -405,7 +464,7 @@ def sample_level_cubic(levels: MipLevels, at: Projections, channels: int) -> Flo
     across = _catmull_rom((x - left).float())
     down = _catmull_rom((y - top).float())
     pixels = levels.pixels[:, :channels]
-    last_row, last_column = (levels.size - 1).unbind(1)
+    last_row, last_column = (levels.size - 1).unbind(-1)
     total = torch.zeros(1, device=x.device)
     for i in range(4):
         row = levels.first + torch.minimum((top.long() + i - 1).clamp_min(0), last_row) * levels.columns
@@ -465,9 +524,10 @@ def _sample_numba(
     for_fill = min_coverage > 0
 
     # What the kernels write
+    chosen = np.tile(np.arange(len(names)), (count, 1)) if rays.cameras is None else rays.cameras.numpy()
     channels = sum(CAMERA_CHANNELS) if for_fill else FEATURES
-    features = np.empty((count, samples, len(names), channels), np.float32)
-    prior = np.zeros((count, samples, len(names)), np.float32)
+    features = np.empty((count, samples, chosen.shape[1], channels), np.float32)
+    prior = np.zeros((count, samples, chosen.shape[1]), np.float32)
     statistics = np.ones((count, samples, STATISTICS), np.float32)
     smallest_masks = statistics[..., -STATISTICS_CHANNELS[-1] :]
 
@@ -481,11 +541,13 @@ def _sample_numba(
     is_source = [float(name in rays.view.source_views) for name in names]
     size_m = float(rays.scale.size_m)
 
+    band_rays = -(-BAND // samples)
+
     def work(band: int) -> None:
-        first = band * BAND
-        end = min(count, first + BAND)
+        first = band * band_rays
+        end = min(count, first + band_rays)
         for n, (per_metre, start, size) in enumerate(views):
-            line = (z, directions, per_metre, start, offsets[n], size)
+            line = (chosen, z, directions, per_metre, start, offsets[n], size)
             camera = (*images[n], depths[n], size_m, is_source[n])
             kernels.sample_camera(first, end, n, *line, *camera, min_coverage, cubic, features, prior)
         if not for_fill:
@@ -493,8 +555,36 @@ def _sample_numba(
         for line, own in zip(silhouettes, outlines, strict=True):
             kernels.compare_silhouette(first, end, z, *line, *own, smallest_masks)
 
-    parallel_for(work, -(-count // BAND))
+    parallel_for(work, -(-count // band_rays))
     return RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
+
+
+def _score_numba(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
+    """`score_cameras_torch` with a compiled kernel."""
+    from viewmend.models.views import _sampler_numba
+
+    kernels: Any = _sampler_numba
+    count, samples = rays.z_m.shape
+    scores = np.zeros((len(sources.cameras), count), np.float32)
+    z = rays.z_m.float().numpy()
+    directions = rays.directions.numpy()
+    offsets = (sources.cameras.centers.double() - rays.origin).numpy()
+    views = _lines(rays, sources.cameras)
+    depths = [depth.numpy() for depth in sources.views.per_camera("depth")]
+    size_m = float(rays.scale.size_m)
+    band_rays = -(-BAND // samples)
+
+    def work(band: int) -> None:
+        first = band * band_rays
+        end = min(count, first + band_rays)
+        for n, line in enumerate(views):
+            per_metre, start, size = line
+            kernels.score_camera(
+                first, end, z, directions, per_metre, start, offsets[n], size, depths[n], size_m, scores[n]
+            )
+
+    parallel_for(work, -(-count // band_rays))
+    return torch.from_numpy(scores).T
 
 
 def _lines(rays: Rays, cameras: Cameras) -> list[tuple]:
