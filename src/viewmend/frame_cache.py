@@ -160,8 +160,7 @@ def cache_frame(
     device = frame.rgb.device
     start = now_s(device)
     masks = _joined(Silhouettes(frame.mask, frame.cameras), carving)
-    own_bounds = None if bounds is None else bounds.to(device)
-    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, own_bounds, config))
+    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, bounds, config))
     return CachedFrame(frame, proxy, ms_since(start, device))
 
 

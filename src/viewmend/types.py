@@ -214,7 +214,8 @@ def _check_mask(mask: object, shape: tuple[int, ...]) -> None:
     convert = "scale it to 0 to 255, and convert it with .byte()"
     arrange = "give one mask per camera, as large as the images"
     masks = check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True)
-    if int(masks.max()) == 1 and int(masks.sum()) > NOISE * masks.numel():
+    largest, total = torch.stack([masks.max().long(), masks.sum()]).tolist()  # waits for a GPU only once
+    if largest == 1 and total > NOISE * masks.numel():
         raise ValueError("expected masks of 0 to 255, got masks of 0 and 1; multiply them by 255")
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from reference.other_device import other_device
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
-from training.other_device import other_device
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_writer import write_capture

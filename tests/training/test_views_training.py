@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 import torch
+from reference.other_device import DEVICE, other_device
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
-from training.other_device import DEVICE, other_device
 
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import project, unproject

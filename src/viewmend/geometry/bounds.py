@@ -20,8 +20,14 @@ class Bounds(OnDevice):
         tensor([1., 2., 1.])
     """
 
+    keeps_host_copy = True
     low: Float[Tensor, "3"]
     high: Float[Tensor, "3"]
+
+    @property
+    def diagonal_m(self) -> float:
+        """Distance between opposite corners, metres."""
+        return float(self.on_host.size_m.norm())
 
     @property
     def center(self) -> Float[Tensor, "3"]:

@@ -1,8 +1,9 @@
 """Pinhole cameras in OpenCV axes: projection, unprojection, and changes of the image grid."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,6 +29,7 @@ class Cameras(OnDevice):
         tensor([250.,   0., 160.])
     """
 
+    keeps_host_copy = True
     names: tuple[str, ...]
     K: Float[Tensor, "view 3 3"]
     camera_from_world: Float[Tensor, "view 4 4"]
@@ -39,10 +41,21 @@ class Cameras(OnDevice):
 
     def __getitem__(self, views: int | slice | Sequence[int]) -> "Cameras":
         """The cameras at these positions; an int gives a `Cameras` of one view."""
-        index = [views] if isinstance(views, int) else range(len(self))[views] if isinstance(views, slice) else views
+        if isinstance(views, int):
+            index = [range(len(self))[views]]
+        elif isinstance(views, slice):
+            index = range(len(self))[views]
+        else:
+            index = views
         names = tuple(self.names[view] for view in index)
-        at = torch.tensor(list(index), dtype=torch.long, device=self.K.device)
-        return Cameras(names, self.K[at], self.camera_from_world[at], self.size_px[at])
+        made = Cameras(names, *(_rows(field, index) for field in (self.K, self.camera_from_world, self.size_px)))
+        return self._with_host(made, lambda host: host[views])
+
+    def _with_host(self, made: "Cameras", change: "Callable[[Cameras], Cameras]") -> "Cameras":
+        """`made` of these cameras, with the copy on the CPU changed in the same way if they are on another device."""
+        if self.K.device.type != "cpu":
+            vars(made)["_host"] = change(self.on_host)
+        return made
 
     def check(self) -> None:
         """ValueError unless names differ, and K, poses and sizes are tensors of the fields' types, one per name."""
@@ -94,10 +107,17 @@ class Cameras(OnDevice):
             raise ValueError(f"expected cameras among {list(self.names)}, got {unknown}; check the spelling")
         return self[[self.names.index(n) for n in names]]
 
-    @property
+    @cached_property
     def world_from_camera(self) -> Float[Tensor, "view 4 4"]:
         """Inverse of `camera_from_world`."""
-        return invert_rigid(self.camera_from_world)
+        with torch.inference_mode(False):  # the result may be used with gradients later
+            return invert_rigid(self.camera_from_world)
+
+    @cached_property
+    def camera_from_pixel(self) -> Float[Tensor, "view 3 3"]:
+        """Inverse of K: from homogeneous pixel coordinates to rays of z = 1 in the camera's axes."""
+        with torch.inference_mode(False):
+            return torch.linalg.inv_ex(self.K).inverse
 
     @property
     def centers(self) -> Float[Tensor, "view 3"]:
@@ -107,8 +127,13 @@ class Cameras(OnDevice):
     @property
     def max_size_px(self) -> tuple[int, int]:
         """Width and height that hold every view."""
-        width, height = self.size_px.amax(0).tolist()
+        width, height = self.on_host.size_px.amax(0).tolist()
         return int(width), int(height)
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Width and height of each view's image, pixels, as Python numbers."""
+        return [(width, height) for width, height in self.on_host.size_px.tolist()]
 
     def resized(self, width: int, height: int) -> "Cameras":
         """Cameras whose images are resampled to width x height pixels (field of view unchanged)."""
@@ -116,13 +141,13 @@ class Cameras(OnDevice):
         K = self.K.clone()
         K[:, :2] *= scale[:, :, None].to(K)
         size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
-        return replace(self, K=K, size_px=size)
+        return self._with_host(replace(self, K=K, size_px=size), lambda host: host.resized(width, height))
 
     def moved(self, x_px: float, y_px: float) -> "Cameras":
         """Cameras whose principal points are moved by (x, y) pixels."""
         K = self.K.clone()
         K[:, :2, 2] += torch.tensor([x_px, y_px]).to(K)
-        return replace(self, K=K)
+        return self._with_host(replace(self, K=K), lambda host: host.moved(x_px, y_px))
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Cameras":
         """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image.
@@ -137,7 +162,16 @@ class Cameras(OnDevice):
         K[:, 0, 2] -= left
         K[:, 1, 2] -= top
         size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
-        return replace(self, K=K, size_px=size)
+        made = replace(self, K=K, size_px=size)
+        return self._with_host(made, lambda host: host.cropped(left, top, width, height))
+
+
+def _rows(values: Tensor, index: Sequence[int]) -> Tensor:
+    """These rows of a tensor, without making an index on its device; neighbours are not copied."""
+    first = index[0] if len(index) else 0
+    if list(index) == list(range(first, first + len(index))):
+        return values[first : first + len(index)]
+    return torch.stack([values[row] for row in index])
 
 
 def is_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:
@@ -148,12 +182,15 @@ def is_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:
 
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
     """All cameras of `parts`, in order."""
-    return Cameras(
+    made = Cameras(
         tuple(name for part in parts for name in part.names),
         torch.cat([part.K for part in parts]),
         torch.cat([part.camera_from_world for part in parts]),
         torch.cat([part.size_px for part in parts]),
     )
+    if made.K.device.type != "cpu":
+        vars(made)["_host"] = concatenate_cameras([part.on_host for part in parts])
+    return made
 
 
 def project(
@@ -175,7 +212,7 @@ def unproject(
 ) -> Float[Tensor, "view point 3"]:
     """World points at these pixels and z-depths, each in its own camera; inverse of `project`."""
     ones = torch.ones_like(uv_px[..., :1])
-    rays = torch.einsum("vij,vpj->vpi", torch.linalg.inv(cameras.K), torch.cat([uv_px, ones], -1))
+    rays = torch.einsum("vij,vpj->vpi", cameras.camera_from_pixel, torch.cat([uv_px, ones], -1))
     world = cameras.world_from_camera
     return torch.einsum("vij,vpj->vpi", world[:, :3, :3], rays * z_m[..., None]) + world[:, None, :3, 3]
 

@@ -1,8 +1,9 @@
 """The visual hull: soft occupancy on a grid, carved by the masks of all cameras."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -21,8 +22,17 @@ TILES = 32
 """The search for the subject's box divides a mask's shorter side into this many tiles."""
 BLOCK = 4
 """The kernels judge blocks of this many voxels, and tiles of this many pooled pixels, whole."""
+PART_BLOCK = 2
+"""The blocks by which a hull's parts are labelled have this many voxels along each side; parts less than a block
+apart count as one."""
+ISO = 0.5
+"""A voxel is inside if its occupancy is at least this; the surface is where it is this."""
+FAINT = 0.1
+"""A voxel is surely empty if its occupancy is not above this."""
 NEAR_M = 1e-6
 """A camera does not see what is nearer than this, in metres."""
+SAMPLES = 1 << 24
+"""Cameras are carved together on a device as long as their voxels are no more than this, which bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +59,22 @@ class HullConfig:
     """Points seen by a smaller share of the cameras count as empty."""
 
 
+Box = tuple[slice, slice, slice]
+"""The first cell along x, y and z, and the one after the last."""
+
+
+@dataclass(frozen=True)
+class GridSummary:
+    """What code on the CPU needs to know of an occupancy grid."""
+
+    blocks: Bool[Tensor, "x_block y_block z_block"]
+    """Blocks of `PART_BLOCK` voxels with any inside."""
+    inside: Box | None
+    """The box of the voxels above `ISO`."""
+    filled: Box | None
+    """The box of the voxels above `FAINT`."""
+
+
 @dataclass(frozen=True)
 class OccupancyGrid:
     """Soft occupancy of cubic voxels: 1 inside, 0 outside, the surface where it is one half."""
@@ -56,12 +82,23 @@ class OccupancyGrid:
     values: Float[Tensor, "x y z"]
     """values[i, j, k] is at low + (i + 0.5, j + 0.5, k + 0.5) * voxel_m."""
     low: Float[Tensor, "3"]
+    """The corner of the grid, metres; it stays on the CPU, wherever the values are."""
     voxel_m: float
+
+    @cached_property
+    def summary(self) -> GridSummary:
+        """The summary of the values, on the CPU; a device is read once."""
+        blocks = any_in_blocks(self.values >= ISO)
+        lines = sum(self.values.shape)
+        parts = [blocks.flatten(), _lines(self.values > ISO), _lines(self.values > FAINT)]
+        blocks_read, inside, filled = torch.cat(parts).cpu().split([blocks.numel(), lines, lines])
+        shape = self.values.shape
+        return GridSummary(blocks_read.view(blocks.shape), _box_of_lines(inside, shape), _box_of_lines(filled, shape))
 
 
 @dataclass(frozen=True)
 class Cubes:
-    """Equal cubes, of voxels or blocks, that cover a box."""
+    """Equal cubes, of voxels or blocks, that cover a box. `low` is on the CPU."""
 
     low: Float[Tensor, "3"]
     side_m: float
@@ -70,18 +107,16 @@ class Cubes:
     @classmethod
     def of(cls, bounds: Bounds, resolution: int) -> "Cubes":
         """Cubes of which the box's longest side has `resolution`."""
-        sides = bounds.size_m.tolist()
+        sides = bounds.on_host.size_m.tolist()
         side_m = max(sides) / resolution
         x, y, z = (max(1, math.ceil(side / side_m - 1e-3)) for side in sides)
-        return cls(bounds.low, side_m, (x, y, z))
+        return cls(bounds.on_host.low, side_m, (x, y, z))
 
-    @property
-    def centers(self) -> Float[Tensor, "cube 3"]:
-        """The cubes' middles, the last axis first."""
-        axes = [
-            self.low[a] + (torch.arange(self.shape[a], device=self.low.device) + 0.5) * self.side_m for a in range(3)
-        ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+    def centers(self, device: torch.device) -> Float[Tensor, "cube 3"]:
+        """The cubes' middles on a device, the last axis first."""
+        axes = [self.low[a] + (torch.arange(self.shape[a]) + 0.5) * self.side_m for a in range(3)]
+        on_device = torch.cat(axes).to(device).split(self.shape)
+        return torch.stack(torch.meshgrid(*on_device, indexing="ij"), -1).view(-1, 3)
 
 
 def visual_hull(
@@ -103,27 +138,62 @@ def visual_hull(
         values = _carve_cpu(mask, pool, cameras, voxels, needed)
     else:
         values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
-    return OccupancyGrid(values, bounds.low, voxels.side_m)
+    return OccupancyGrid(values, voxels.low, voxels.side_m)
 
 
 def occupied_bounds(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> Bounds | None:
-    """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
+    """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it.
+
+    The box stays on the CPU, where its numbers decide how many voxels there are.
+    """
     needed = needed_views(len(cameras), config)
     tile = max(1, min(mask.shape[1:]) // TILES)
     if _has_kernels(mask):
+        if not bool(mask.any()):
+            return None
         find = partial(_occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras)
     else:
         find = partial(occupied_blocks, count_tiles(mask, tile), tile, cameras)
+    box = bounds.on_host
     for _ in range(config.coarse_passes):
-        blocks = Cubes.of(bounds, config.coarse_resolution)
-        index = find(blocks, needed).nonzero()
-        if not len(index):
+        blocks = Cubes.of(box, config.coarse_resolution)
+        sides = filled_sides(find(blocks, needed))
+        if sides is None:
             return None
-        low = bounds.low + index.amin(0) * blocks.side_m
-        bounds = Bounds(low, torch.minimum(bounds.low + (index.amax(0) + 1) * blocks.side_m, bounds.high))
-    return bounds
+        first = torch.tensor([side.start for side in sides])
+        end = torch.tensor([side.stop for side in sides])
+        low = box.low + first * blocks.side_m
+        box = Bounds(low, torch.minimum(box.low + end * blocks.side_m, box.high))
+    return box
+
+
+def filled_sides(grid: Bool[Tensor, "x y z"]) -> Box | None:
+    """The box of a grid's true cells, None where there are none; reads a device once."""
+    return _box_of_lines(_lines(grid).cpu(), grid.shape)
+
+
+def _lines(grid: Bool[Tensor, "x y z"]) -> Bool[Tensor, "line"]:
+    """Whether any cell is true in each plane across x, then across y, then across z."""
+    over_x = grid.any(0)
+    return torch.cat([grid.flatten(1).any(1), over_x.any(1), over_x.any(0)])
+
+
+def _box_of_lines(lines: Bool[Tensor, "line"], shape: Sequence[int]) -> Box | None:
+    """The box of the planes that are true, in the order of `_lines`; None where there are none."""
+    x, y, z = (line.nonzero()[:, 0].tolist() for line in lines.split(tuple(shape)))
+    if not x:
+        return None
+    return slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1), slice(z[0], z[-1] + 1)
+
+
+def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_block z_block"]:
+    """Whether any voxel of each block of `PART_BLOCK` along each side is true."""
+    padded = pad(voxels, [end for side in reversed(voxels.shape) for end in (0, -side % PART_BLOCK)])
+    for axis in range(3):
+        padded = padded.unflatten(axis, (-1, PART_BLOCK)).any(axis + 1)
+    return padded
 
 
 def needed_views(views: int, config: HullConfig) -> int:
@@ -133,8 +203,9 @@ def needed_views(views: int, config: HullConfig) -> int:
 
 def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
     """The image size of `length_m` at the middle of the bounds, in the median camera that has it in front."""
-    z = project(bounds.center[None], cameras)[1][:, 0]
-    size = (cameras.K[:, 0, 0] * length_m / z)[z > length_m]
+    rig = cameras.on_host
+    z = project(bounds.on_host.center[None], rig)[1][:, 0]
+    size = (rig.K[:, 0, 0] * length_m / z)[z > length_m]
     return float(size.median()) if len(size) else 1.0
 
 
@@ -220,25 +291,32 @@ def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras
         ValueError: there is one camera only, or the cameras look away from each other.
     """
     check_views(cameras)
-    some = [v for v in range(len(cameras)) if bool(mask[v].any())]
+    rig = cameras.on_host
+    boxes = _mask_boxes(mask)
+    some = [view for view in range(len(rig)) if boxes[view] is not None]
     if len(some) < 2:
-        return bounds_from_cameras(cameras)
-    cameras = cameras[some]
-    boxes = torch.stack([_mask_box(mask[v]) for v in some]).to(cameras.K)
-    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+        return bounds_from_cameras(rig)
+    seeing = rig[some]
+    box = torch.tensor([boxes[view] for view in some]).to(rig.K)
+    middle = (box[:, :2] + box[:, 2:]) / 2
     pixels = torch.cat([middle, torch.ones_like(middle[:, :1])], -1)
-    rays = torch.linalg.solve(cameras.K, pixels[..., None])
-    directions = torch.nn.functional.normalize((cameras.world_from_camera[:, :3, :3] @ rays)[..., 0], dim=-1)
-    focal = torch.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], -1)
+    rays = torch.linalg.solve(seeing.K, pixels[..., None])
+    directions = torch.nn.functional.normalize((seeing.world_from_camera[:, :3, :3] @ rays)[..., 0], dim=-1)
+    focal = torch.stack([seeing.K[:, 0, 0], seeing.K[:, 1, 1]], -1)
     # The subject may be nearer to a camera than its middle and is round: take half as much again.
-    half = 1.5 * ((boxes[:, 2:] - boxes[:, :2]) / 2 / focal).amax(-1)
-    return _cube_around(cameras, directions, half, largest=True)
+    half = 1.5 * ((box[:, 2:] - box[:, :2]) / 2 / focal).amax(-1)
+    return _cube_around(seeing, directions, half, largest=True)
 
 
-def _mask_box(mask: UInt8[Tensor, "height width"]) -> Float[Tensor, "4"]:
-    columns = mask.any(0).nonzero()[:, 0]
-    rows = mask.any(1).nonzero()[:, 0]
-    return torch.stack([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]).float()
+def _mask_boxes(mask: UInt8[Tensor, "view height width"]) -> list[tuple[int, int, int, int] | None]:
+    """First column and row of each mask's foreground, and the column and row after the last; None without any."""
+    lines = torch.cat([mask.any(1), mask.any(2)], 1).cpu()
+    boxes = []
+    for view in range(len(mask)):
+        columns = lines[view, : mask.shape[2]].nonzero()[:, 0].tolist()
+        rows = lines[view, mask.shape[2] :].nonzero()[:, 0].tolist()
+        boxes.append((columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if columns else None)
+    return boxes
 
 
 def _cube_around(
@@ -286,15 +364,18 @@ def carve(
     soft: UInt8[Tensor, "view row column"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
 ) -> Float[Tensor, "x y z"]:
     """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
-    points = voxels.centers
+    points = voxels.centers(soft.device)
     values = torch.ones_like(points[:, 0])
     seen = torch.zeros_like(values, dtype=torch.int32)
-    for view in range(len(cameras)):
-        uv, z = project(points, cameras[view])
-        sees = in_view(uv, z, cameras[view])[0]
-        value = sample_bilinear(soft[view].float()[None, None] / 255, uv / pool, "border")[0, :, 0]
-        values = torch.where(sees, values.minimum(value), values)
-        seen += sees
+    step = max(1, SAMPLES // len(points))
+    for first in range(0, len(cameras), step):
+        some = cameras[first : first + step]
+        uv, z = project(points, some)
+        sees = in_view(uv, z, some)
+        images = soft[first : first + step, None].float() / 255
+        value = sample_bilinear(images, uv / pool, "border")[..., 0]
+        values = values.minimum(torch.where(sees, value, 1.0).amin(0))
+        seen += sees.sum(0, dtype=torch.int32)
     return torch.where(seen >= needed, values, 0.0).view(voxels.shape)
 
 
@@ -302,23 +383,23 @@ def occupied_blocks(
     sums: Int[Tensor, "view row column"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
 ) -> Bool[Tensor, "x y z"]:
     """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
-    centers, radius = blocks.centers, blocks.side_m * 3**0.5 / 2
+    radius = blocks.side_m * 3**0.5 / 2
     P = cameras.K @ cameras.camera_from_world[:, :3]
-    empty = torch.zeros_like(centers[:, 0], dtype=torch.bool)
-    seen = torch.zeros_like(centers[:, 0], dtype=torch.int32)
-    for view in range(len(cameras)):
-        uv, z = project(centers, cameras[view])
-        uv, z, size = uv[0], z[0], cameras.size_px[view]
-        # How far from its centre's image the image of the ball around a block can reach.
-        slope = (P[view, None, :2, :3] - uv[:, :, None] * P[view, 2, :3]).norm(dim=-1)
-        reach = slope * (radius / (z - radius).clamp(min=NEAR_M))[:, None]
-        first, last = uv - reach, uv + reach
-        in_front = z - radius > NEAR_M
-        outside = ((last < 0) | (first >= size)).any(-1)
-        inside = ((first >= 0) & (last < size)).all(-1)
-        empty |= in_front & inside & (_foreground_tiles(sums[view], tile, first, last) == 0)
-        seen += (z + radius > NEAR_M) & ~(in_front & outside)
-    return (~empty & (seen >= needed)).view(blocks.shape)
+    uv, z = project(blocks.centers(sums.device), cameras)
+    # How far from its centre's image the image of the ball around a block can reach.
+    slope = (P[:, None, :2, :3] - uv[..., None] * P[:, None, 2:, :3]).norm(dim=-1)
+    reach = slope * (radius / (z - radius).clamp(min=NEAR_M))[..., None]
+    first = uv - reach
+    last = uv + reach
+
+    size = cameras.size_px[:, None]
+    in_front = z - radius > NEAR_M
+    outside = ((last < 0) | (first >= size)).any(-1)
+    inside = ((first >= 0) & (last < size)).all(-1)
+    empty = in_front & inside & (_foreground_tiles(sums, tile, first, last) == 0)
+    seen = (z + radius > NEAR_M) & ~(in_front & outside)
+    some = sums[:, -1, -1].any()  # without any foreground, blocks that no image holds whole are empty, too
+    return (~empty.any(0) & (seen.sum(0) >= needed) & some).view(blocks.shape)
 
 
 def count_tiles(mask: UInt8[Tensor, "view height width"], tile: int) -> Int[Tensor, "view row column"]:
@@ -330,12 +411,19 @@ def count_tiles(mask: UInt8[Tensor, "view height width"], tile: int) -> Int[Tens
 
 
 def _foreground_tiles(
-    sums: Int[Tensor, "row column"], tile: int, first: Float[Tensor, "block 2"], last: Float[Tensor, "block 2"]
-) -> Int[Tensor, "block"]:
+    sums: Int[Tensor, "view row column"],
+    tile: int,
+    first: Float[Tensor, "view block 2"],
+    last: Float[Tensor, "view block 2"],
+) -> Int[Tensor, "view block"]:
     """How many tiles with any foreground each window of pixels, and one and a half pixels around it, touches."""
-    end = torch.tensor([sums.shape[1], sums.shape[0]], device=sums.device) - 2
-    largest = tile * max(sums.shape)  # beyond the image
-    from_tile = ((first - 1.5).clamp(0, largest) / tile).long().minimum(end)
-    to_tile = ((last + 1.5).clamp(0, largest) / tile).long().minimum(end) + 1
-    (left, top), (right, bottom) = from_tile.unbind(-1), to_tile.unbind(-1)
-    return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    rows, columns = sums.shape[1:]
+    largest = tile * max(rows, columns)  # beyond the image
+    from_tile = ((first - 1.5).clamp(0, largest) / tile).long()
+    to_tile = ((last + 1.5).clamp(0, largest) / tile).long()
+    left = from_tile[..., 0].clamp(max=columns - 2)
+    top = from_tile[..., 1].clamp(max=rows - 2)
+    right = to_tile[..., 0].clamp(max=columns - 2) + 1
+    bottom = to_tile[..., 1].clamp(max=rows - 2) + 1
+    view = torch.arange(len(sums), device=sums.device)[:, None]
+    return sums[view, bottom, right] - sums[view, top, right] - sums[view, bottom, left] + sums[view, top, left]

@@ -9,11 +9,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.geometry.hull import OccupancyGrid
+from viewmend.geometry.hull import ISO, PART_BLOCK, OccupancyGrid
 from viewmend.geometry.sampling import in_view
 
-BLOCK = 2
-"""The blocks that are labelled have this many voxels along each side; parts less than a block apart count as one."""
 CELL = 1.25
 """Images are compared in square cells, whose side is this many times the nearest voxel's image, so that no cell inside
 a part is missed."""
@@ -34,29 +32,27 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
     """
     from scipy.ndimage import label
 
-    inside = grid.values >= 0.5
-    occupied = _any_in_blocks(inside)
     # The number of each block's part, from 1; blocks that share a corner are connected.
-    labels, count = label(occupied.cpu().numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    occupied = grid.summary.blocks
+    labels, count = label(occupied.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
         return grid
-    index = _surface(inside).nonzero()
+
+    # which parts no camera needs: a search over few cells, on the CPU
+    index = _surface(grid.values >= ISO).cpu().nonzero()
     points = grid.low + (index + 0.5) * grid.voxel_m
-    dropped = _unneeded(labels[tuple((index // BLOCK).T.cpu().numpy())], points, cameras, grid.voxel_m)
+    dropped = _unneeded(labels[tuple((index // PART_BLOCK).T.numpy())], points, cameras.on_host, grid.voxel_m)
     if not dropped:
         return grid
-    blocks = torch.from_numpy(np.isin(labels, dropped)).to(occupied.device)
-    around = _grown(blocks) & ~(occupied & ~blocks)  # there soft values fade out
+
+    # empty their blocks, and the space around them where soft values fade out
+    blocks = torch.from_numpy(np.isin(labels, dropped))
+    around = _grown(blocks) & ~(occupied & ~blocks)
     x, y, z = grid.values.shape
-    remove = _to_voxels(blocks)[:x, :y, :z] | (_to_voxels(around)[:x, :y, :z] & (grid.values < 0.5))
+    device = grid.values.device
+    outside = grid.values < ISO
+    remove = _to_voxels(blocks.to(device))[:x, :y, :z] | (_to_voxels(around.to(device))[:x, :y, :z] & outside)
     return replace(grid, values=grid.values.masked_fill(remove, 0.0))
-
-
-def _any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_block z_block"]:
-    padded = pad(voxels, [end for side in reversed(voxels.shape) for end in (0, -side % BLOCK)])
-    for axis in range(3):
-        padded = padded.unflatten(axis, (-1, BLOCK)).any(axis + 1)
-    return padded
 
 
 def _grown(blocks: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
@@ -81,7 +77,7 @@ def _surface(inside: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
 
 def _to_voxels(blocks: Bool[Tensor, "x_block y_block z_block"]) -> Bool[Tensor, "x y z"]:
     for axis in range(3):
-        blocks = blocks.repeat_interleave(BLOCK, axis)
+        blocks = blocks.repeat_interleave(PART_BLOCK, axis)
     return blocks
 
 
@@ -98,10 +94,10 @@ def _unneeded(
     sees = in_view(uv, z, cameras)
     views = []  # of each camera: how many parts each cell is covered by, and the cells of each part
     for view in range(len(cameras)):
-        own = sees[view].cpu().numpy()
+        own = sees[view].numpy()
         if own.any():
             cell_px = CELL * float(cameras.K[view, 0, 0]) * voxel_m / float(z[view, sees[view]].min())
-            x, y = (uv[view, sees[view]].cpu().numpy() / cell_px).astype(np.int64).T + 1
+            x, y = (uv[view, sees[view]].numpy() / cell_px).astype(np.int64).T + 1
             views.append(_Cells.of(part[own], y, x))
     dropped = []
     for candidate in sizes.argsort(kind="stable")[(sizes == 0).sum() :].tolist():

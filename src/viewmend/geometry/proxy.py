@@ -1,6 +1,7 @@
 """The geometry proxy G[t] of section 1: a mesh of the subject that gives its depth in any camera."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, UInt8
@@ -19,7 +20,7 @@ from viewmend.geometry.hull import (
 from viewmend.geometry.hull_parts import without_floating_parts
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
-from viewmend.geometry.surface import extract_surface, occupied_box
+from viewmend.geometry.surface import extract_surface
 from viewmend.geometry.threads import light_operations
 from viewmend.utils.tensors import OnDevice
 
@@ -40,6 +41,11 @@ class GeometryProxy(OnDevice):
     """Unit, outward, one a vertex."""
     bounds: Bounds
     """The box that was carved at full resolution."""
+
+    @cached_property
+    def center(self) -> Float[Tensor, "3"]:
+        """The middle of the subject: the mean of the vertices, or the box's middle without any; on the CPU, metres."""
+        return self.mesh.vertices.mean(0).cpu() if len(self.mesh.vertices) else self.bounds.on_host.center
 
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
         """z-depth of the surface in each camera, metres; 0 where there is none.
@@ -67,11 +73,11 @@ def reconstruct(
     """
     config = config or HullConfig()
     check_views(cameras)
-    bounds = bounds or bounds_from_masks(mask, cameras)
-    box = occupied_bounds(mask, cameras, bounds, config) if bool(mask.any()) else None
+    whole = (bounds or bounds_from_masks(mask, cameras)).on_host
+    box = occupied_bounds(mask, cameras, whole, config)
     if box is None:
         nothing = torch.zeros(0, 3, device=mask.device)
-        return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
+        return GeometryProxy(Mesh(nothing, nothing.int()), nothing, whole.to(mask.device))
     grid = without_floating_parts(visual_hull(mask, cameras, box, config), cameras)
     # Where images end, the search cannot tell empty from unknown until its blocks are as small as voxels.
     for _ in range(RECARVINGS):
@@ -81,15 +87,16 @@ def reconstruct(
         box = tight
         grid = without_floating_parts(visual_hull(mask, cameras, tight, config), cameras)
     mesh = extract_surface(grid)
-    return GeometryProxy(mesh, vertex_normals(mesh), box)
+    return GeometryProxy(mesh, vertex_normals(mesh), box.to(mask.device))
 
 
 def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
     """The box of all that is not surely empty, with two voxels around it, within `bounds`; None for an empty grid."""
-    filled = occupied_box(grid.values > 0.1)
-    if filled is None:
+    sides = grid.summary.filled
+    if sides is None:
         return None
-    first, end = torch.tensor([(side.start, side.stop) for side in filled], device=grid.low.device).T
+    first = torch.tensor([max(side.start - 1, 0) for side in sides])
+    end = torch.tensor([min(side.stop + 1, size) for side, size in zip(sides, grid.values.shape, strict=True)])
     low = grid.low + (first - 1) * grid.voxel_m
     high = grid.low + (end + 1) * grid.voxel_m
     return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))

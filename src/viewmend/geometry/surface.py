@@ -7,11 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from viewmend.geometry.hull import OccupancyGrid
+from viewmend.geometry.hull import ISO, OccupancyGrid
 from viewmend.geometry.mesh import Mesh
 
-ISO = 0.5
-"""The surface is where the occupancy has this value."""
 EDGES = tuple((k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1)
 """The twelve edges of a cell are pairs of corners: four along x, four along y, four along z."""
 
@@ -26,15 +24,18 @@ def extract_surface(grid: OccupancyGrid) -> Mesh:
     exactly two triangles. An empty grid gives a mesh of no vertices.
     """
     device = grid.values.device
-    box = occupied_box(grid.values > ISO)
-    if box is None:
+    sides = grid.summary.inside
+    if sides is None:
         empty = torch.zeros(0, 3, device=device)
         return Mesh(empty, empty.int())
+    # the box of what is inside and one voxel around it, where the grid has it, in a border of empty voxels
+    box = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in sides)
     values = torch.nn.functional.pad(grid.values[box], (1, 1, 1, 1, 1, 1))
-    first = torch.tensor([side.start for side in box], device=device)
     vertices, faces = (march_numba if values.device.type == "cpu" else march_torch)(values)
     # Padding moved the origin by one voxel, values sit in the middle of theirs.
-    return Mesh((vertices + first - 0.5) * grid.voxel_m + grid.low, faces)
+    first = torch.tensor([float(side.start) for side in box])
+    first, low = torch.stack([first, grid.low]).to(device)
+    return Mesh((vertices + first - 0.5) * grid.voxel_m + low, faces)
 
 
 def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
@@ -47,61 +48,58 @@ def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3
     kernels.place_crossings(grid, ISO, vertices.numpy(), vertex_of_edge)
     # A vertex is in one loop of each of its edge's four cells, and n vertices of a loop make n - 2 triangles.
     faces = torch.empty(4 * len(vertices), 3, dtype=torch.int32)
-    starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
-    count = kernels.connect(grid, ISO, triangle_table().numpy(), starts.numpy(), vertex_of_edge, faces.numpy())
+    table, starts = _march_tables(values.device)
+    count = kernels.connect(grid, ISO, table.numpy(), starts.numpy(), vertex_of_edge, faces.numpy())
     return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
 
 
 def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """The same on any device."""
+    """The same on any device, which is read twice."""
+    # where the surface crosses an edge, along x, then y, then z
     inside = values > ISO
-    vertex_of_edge = torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
-    parts = []
-    count = 0
+    changes = torch.zeros(3, *values.shape, dtype=torch.bool, device=values.device)
     for axis in range(3):
         steps = values.shape[axis] - 1
-        changes = inside.narrow(axis, 0, steps) != inside.narrow(axis, 1, steps)
-        x, y, z = changes.nonzero(as_tuple=True)
-        position = torch.stack([x, y, z], -1).to(values)
-        near = values[x, y, z]
-        far = values.narrow(axis, 1, steps)[x, y, z]
-        position[:, axis] += (ISO - near) / (far - near)
-        vertex_of_edge[axis, x, y, z] = torch.arange(count, count + len(x), dtype=torch.int32, device=x.device)
-        parts.append(position)
-        count += len(x)
-    return torch.cat(parts), _triangles(inside, vertex_of_edge)
+        torch.ne(inside.narrow(axis, 0, steps), inside.narrow(axis, 1, steps), out=changes[axis].narrow(axis, 0, steps))
+    edges = changes.nonzero()
+    vertex_of_edge = torch.full((3 * inside.numel(),), -1, dtype=torch.int32, device=values.device)
+    axis, x, y, z = edges.unbind(1)
+    size_y, size_z = values.shape[1:]
+    cell = (x * size_y + y) * size_z + z
+    vertex_of_edge[axis * inside.numel() + cell] = torch.arange(len(edges), dtype=torch.int32, device=values.device)
+
+    # how far along the edge
+    stride = torch.where(axis == 0, size_y * size_z, torch.where(axis == 1, size_z, 1))
+    near = values.flatten()[cell]
+    far = values.flatten()[cell + stride]
+    along = (ISO - near) / (far - near)
+    position = edges[:, 1:].to(values)
+    position += (axis[:, None] == torch.arange(3, device=axis.device)) * along[:, None]
+    return position, _triangles(inside, vertex_of_edge)
 
 
-def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
-    """The box of inside voxels and one voxel around them, where the grid has it."""
-    over_x = inside.any(0)
-    sides = []
-    for line in (inside.flatten(1).any(1), over_x.any(1), over_x.any(0)):
-        index = line.nonzero()[:, 0].tolist()
-        if not index:
-            return None
-        sides.append(slice(max(index[0] - 1, 0), min(index[-1] + 2, len(line))))
-    return tuple(sides)
-
-
-def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "axis=3 x y z"]) -> Int[Tensor, "face 3"]:
+def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "edge"]) -> Int[Tensor, "face 3"]:
     """The triangles of all cells, as vertices; `vertex_of_edge` has those on the edges from (x, y, z) along an axis."""
-    device = inside.device
     size_x, size_y, size_z = inside.shape
-    case = torch.zeros(size_x - 1, size_y - 1, size_z - 1, dtype=torch.uint8, device=device)
+    case = torch.zeros(size_x - 1, size_y - 1, size_z - 1, dtype=torch.uint8, device=inside.device)
     for k in range(8):
         x, y, z = k & 1, k >> 1 & 1, k >> 2 & 1
         corner = inside[x : size_x - 1 + x, y : size_y - 1 + y, z : size_z - 1 + z]
         case |= corner.to(torch.uint8) << k
-    cell = ((case > 0) & (case < 255)).nonzero(as_tuple=True)
-    edges = triangle_table().to(device)[case[cell].long()]
-    stride = torch.tensor([size_y * size_z, size_z, 1], device=device)
+    table, starts = _march_tables(inside.device)
+    x, y, z, slot = (table[..., 0] >= 0)[case.long()].nonzero().unbind(1)
+    edges = table[case[x, y, z].long(), slot]
     # Where each edge starts, relative to its cell, in the flat (axis, x, y, z) order of `vertex_of_edge`.
-    start = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k, _ in EDGES], device=device) @ stride
-    start += torch.arange(3, device=device).repeat_interleave(4) * inside.numel()
-    owner, slot = (edges[..., 0] >= 0).nonzero(as_tuple=True)
-    flat = (torch.stack(cell, -1) @ stride)[owner]
-    return vertex_of_edge.flatten()[flat[:, None] + start[edges[owner, slot]]]
+    axis, dx, dy, dz = starts[edges].unbind(-1)
+    flat = ((axis * size_x + x[:, None] + dx) * size_y + y[:, None] + dy) * size_z + z[:, None] + dz
+    return vertex_of_edge[flat]
+
+
+@cache
+def _march_tables(device: torch.device) -> tuple[Int[Tensor, "256 5 3"], Int[Tensor, "12 4"]]:
+    """`triangle_table`, and axis and first corner of each edge, on a device."""
+    starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
+    return triangle_table().to(device), starts.to(device)
 
 
 @cache

@@ -7,7 +7,7 @@ would occupy several times what it stores. So they are copied to their own memor
 import mmap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,9 +23,22 @@ T = TypeVar("T")
 class OnDevice:
     """Base class of dataclasses of tensors."""
 
+    keeps_host_copy: ClassVar[bool] = False
+    """Whether a copy on another device keeps what it was copied from, because code on the CPU needs its numbers."""
+
     def to(self: T, device: torch.device | str) -> T:
         """The same with all tensors on `device`."""
         return to_device(self, device)
+
+    @property
+    def on_host(self: T) -> T:
+        """The same on the CPU; itself if it is there. A device is read only once, and not at all for a copy on it."""
+        if "_host" in vars(self):
+            return vars(self)["_host"]
+        host = to_device(self, "cpu")
+        if host is not self:
+            vars(self)["_host"] = host
+        return host
 
 
 def to_device(value: T, device: torch.device | str) -> T:
@@ -52,12 +65,23 @@ def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(value, Tensor):
         return change(value)
     if type(value) is tuple:
-        return tuple(_changed(item, change) for item in value)
+        items = tuple(_changed(item, change) for item in value)
+        same = all(new is old for new, old in zip(items, value, strict=True))
+        return value if same else items
     if not is_dataclass(value) or isinstance(value, type):
         return value
-    parts = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-    changed = {name: new for name, part in parts.items() if (new := _changed(part, change)) is not part}
-    return replace(value, **changed) if changed else value
+    changed = {}
+    for field in fields(value):
+        part = getattr(value, field.name) if field.init else None
+        new = _changed(part, change)
+        if new is not part:
+            changed[field.name] = new
+    if not changed:
+        return value
+    made = replace(value, **changed)
+    if isinstance(value, OnDevice) and value.keeps_host_copy:
+        vars(made)["_host"] = value.on_host
+    return made
 
 
 def size_bytes(value: Any) -> int:
