@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras, concatenate_cameras
+from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import REMEMBERED_FRAMES, Memory
@@ -159,19 +159,9 @@ def cache_frame(
         )
     device = frame.rgb.device
     start = now_s(device)
-    masks = _joined(Silhouettes(frame.mask, frame.cameras), carving)
+    masks = Silhouettes(frame.mask, frame.cameras).joined(carving)
     proxy = to_mmap(reconstruct(masks.mask, masks.cameras, bounds, config))
     return CachedFrame(frame, proxy, ms_since(start, device))
-
-
-def _joined(masks: Silhouettes, more: Silhouettes | None) -> Silhouettes:
-    """The masks of both, padded to the size of the largest."""
-    if more is None:
-        return masks
-    height = max(masks.mask.shape[1], more.mask.shape[1])
-    width = max(masks.mask.shape[2], more.mask.shape[2])
-    padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (masks.mask, more.mask)]
-    return Silhouettes(torch.cat(padded), concatenate_cameras([masks.cameras, more.cameras]))
 
 
 def evict(

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.utils.tensors import OnDevice, check_tensor, extremes
 
@@ -207,6 +207,15 @@ class Silhouettes(OnDevice):
         """The masks of these cameras, in this order; ValueError for an unknown name."""
         index = [self.cameras.names.index(name) for name in names]
         return Silhouettes(self.mask[index], self.cameras.select(names))
+
+    def joined(self, others: "Silhouettes | None") -> "Silhouettes":
+        """These masks and those of other cameras, padded to the largest."""
+        if others is None:
+            return self
+        height = max(self.mask.shape[1], others.mask.shape[1])
+        width = max(self.mask.shape[2], others.mask.shape[2])
+        padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (self.mask, others.mask)]
+        return Silhouettes(torch.cat(padded), concatenate_cameras([self.cameras, others.cameras]))
 
 
 def _check_mask(mask: object, shape: tuple[int, ...]) -> None:

@@ -10,6 +10,7 @@ from viewmend.evaluation.scores import ViewScores
 from viewmend.scenes.studio_scenes import StudioScene
 from viewmend.studio.stage import StudioConfig
 
+ORIGIN_PX = ("sources_px", "others_px", "past_px", "only_past_px")
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)
 
 
@@ -55,8 +56,8 @@ def make_frame():
 
     def make(**scores: float | None) -> ViewScores:
         pixels = {"time": 0, "width_px": 20, "height_px": 10, "hull_px": 100, "hole_px": 60, "hole_fg_px": 60}
-        values = dict.fromkeys(f.name for f in fields(ViewScores)) | pixels | {"past_px": 0, "psnr_whole": 30.0}
-        values |= {"psnr_whole_rendered": 20.0}
+        values = dict.fromkeys(f.name for f in fields(ViewScores)) | pixels | dict.fromkeys(ORIGIN_PX, 0)
+        values |= {"psnr_whole": 30.0, "psnr_whole_rendered": 20.0}
         return ViewScores(**(values | scores))  # pyright: ignore[reportArgumentType]
 
     return make

@@ -95,6 +95,20 @@ def test_holes_visible_only_in_the_past_have_their_own_mean(make_cell, make_fram
     assert scores.mean("hole_fraction", "only_past") == pytest.approx((1 + 0.05) / 2)
 
 
+def test_holes_are_counted_by_what_shows_them(make_cell, make_frame):
+    frame = make_frame(hole_px=100, hole_fg_px=90, sources_px=20, others_px=50, past_px=30, only_past_px=10)
+    scores = records([make_cell("s", "telea", "R48", [frame])])
+    shares = {kind: scores.mean("share_of_holes", kind) for kind in ("phantom", "sources", "others", "past")}
+    assert shares == pytest.approx({"phantom": 0.1, "sources": 0.2, "others": 0.5, "past": 0.1})
+    assert scores.mean("share_of_holes", "sources_past") == 0.3
+
+
+def test_the_standard_error_is_over_scenes(make_cell, make_frame):
+    cells = [make_cell(f"s{db}", "telea", "A", [make_frame(psnr_holes=db)]) for db in (10.0, 12.0, 14.0)]
+    assert records(cells).standard_error("psnr", "holes") == pytest.approx(2 / 3**0.5)
+    assert records(cells[:2]).standard_error("psnr", "holes") is None
+
+
 def test_speed_covers_frames_with_holes(make_cell, make_frame):
     frames = [make_frame() for _ in range(100)] + [make_frame(hole_px=0)]
     taken = speed([make_cell("s", "telea", "A", frames, step_ms=[*map(float, range(1, 101)), 1e9])])

@@ -80,8 +80,8 @@ def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame
     assert {"holes, dB", "whole, dB"} <= set(grid.heads)
     assert not {"failed", "SSIM whole", "flicker", "only past"} & set(grid.heads)
     column = grid.heads.index("holes, dB")
-    assert [row[column] for row in grid.rows[:2]] == ["22.00 ± 2.0", "**25.50 ± 0.9**"]
-    assert grid.rows[2][column] == "30.00 ± 0.0", "is given the truth"
+    assert [row[column] for row in grid.rows[:2]] == ["22.00 ± 1.15", "**25.50 ± 0.50**"]
+    assert grid.rows[2][column] == "30.00 ± 0.00", "is given the truth"
     assert not any("**" in row[grid.heads.index("whole, dB")] for row in grid.rows), "all are equal"
     assert ["**" in row[grid.heads.index("LPIPS whole")] for row in grid.rows] == [False, True, False]
 

@@ -82,11 +82,29 @@ def test_surface_visible_only_in_the_past_is_known(turning):
     last = frames[-1]
     names = last.inputs.cameras.names
     assert last.seen.names == names and last.seen.seen.shape[0] == 4, "this frame, and three before"
-    alone = last.seen.by_past_alone(names)
+    alone = last.seen.origins(names).past
     surface = last.truth.depth[0] > 0
     assert 0 < int(alone.sum()) < int(surface.sum()) and not (alone & ~surface).any()
     assert torch.equal(alone, last.seen.seen[1:].any((0, 1)) & ~last.seen.seen[0].any(0))
-    assert not replace(last.seen, seen=last.seen.seen[[0, 0]]).by_past_alone(names).any(), "nothing moved"
+    assert not replace(last.seen, seen=last.seen.seen[[0, 0]]).origins(names).past.any(), "nothing moved"
+
+
+def test_each_pixel_of_the_surface_has_one_origin(turning):
+    last = list(turning.frames())[-1]
+    source, *rest = last.inputs.cameras.names
+    found = last.seen.origins([source])
+    seen = last.seen.seen
+    height, width = seen.shape[2:]
+    for row in range(0, height, 3):
+        for column in range(0, width, 3):
+            point = seen[:, :, row, column]
+            now = {name for name, by in zip(last.seen.names, point[0].tolist(), strict=True) if by}
+            before = bool(point[1:, last.seen.names.index(source)].any())
+            expected = (source in now, source not in now and bool(now & set(rest)), before and not now)
+            here = (found.sources, found.others, found.past)
+            assert tuple(bool(mask[row, column]) for mask in here) == expected
+            assert bool(found.sources_past[row, column]) == (before and source not in now)
+    assert all(bool(mask.any()) for mask in (found.sources, found.others))
 
 
 class Counts(Telea):

@@ -1,6 +1,7 @@
 """The sets are fixed, and true motion is true."""
 
 import hashlib
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from reference.ball import ring
 from viewmend.data.errors import CaptureError
 from viewmend.metrics.image_quality import warp_error
 from viewmend.scenes.capture_scenes import capture_set, evenly_around
-from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural_set
+from viewmend.scenes.studio_scenes import RIG_TIMES, StudioScene, performer_set, procedural_set, rig_set
 from viewmend.studio.stage import StudioConfig
 
 P_SHA256 = "98fb42fd06fe55d11f1155fecbfd5175f729136f2808b09f00f36f65849f625e"
@@ -73,6 +74,39 @@ def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_
     assert (seen & mask).sum() > 0.7 * mask.sum() and not (seen & ~mask).sum() > 0.05 * mask.sum()
     now, before = (f.truth.rgb[0].float() / 255 for f in (second, first))
     assert warp_error(now, before, second.backward_flow_px, mask) < 0.03
+
+
+def test_cameras_without_colour_give_the_same_masks_and_visibility():
+    config = StudioConfig(seed=1, cameras=7, rig="layers", frames=4, size_px=48, samples_per_side=2)
+    dense = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02", tempo="dance", scored_from=3)
+    sparse = replace(dense, coloured=5)
+    assert dense.definition != sparse.definition
+    for whole, part in zip(dense.frames(), sparse.frames(), strict=True):
+        names = part.inputs.cameras.names
+        assert len(names) == (5 if part.inputs.time == 3 else 4) and sparse.held not in part.carving.cameras.names
+        assert {*names, *part.carving.cameras.names} == set(whole.inputs.cameras.names)
+        assert torch.equal(part.inputs.rgb, whole.inputs.select(names).rgb)
+        assert torch.equal(part.carving.mask, whole.inputs.select(part.carving.cameras.names).mask)
+        assert torch.equal(part.truth.rgb, whole.truth.rgb)
+    order = [part.seen.names.index(name) for name in whole.seen.names]
+    assert torch.equal(part.seen.seen[0, order], whole.seen.seen[0])
+    sources = list(names[:3])
+    assert torch.equal(part.seen.origins(sources).others, whole.seen.origins(sources).others)
+
+
+def test_the_rigs_of_the_paper_leave_one_camera_out_and_draw_only_the_window():
+    for name, count in (("R48", 48), ("R34", 34)):
+        scenes = rig_set(name)
+        assert len(scenes) == len({s.definition for s in scenes}) == 30
+        assert len(scenes[0].studio().cameras) == count
+        assert len({s.held for s in scenes}) > 10 and scenes[0].times == RIG_TIMES == (0, 10, 20, 27, 28, 29, 30)
+
+
+def test_the_rigs_of_the_paper_use_the_people_whose_views_have_holes(shared, tmp_path):
+    assert [len(rig_set(name, shared / "performers")) for name in ("R48", "R34")] == [44, 52]
+    for name in ("a.glb", "m.bvh"):
+        (tmp_path / name).write_text(name)
+    assert [s.name for s in rig_set("R48", tmp_path)][30:] == ["R48-a-m"]
 
 
 def test_cameras_are_taken_evenly_around():

@@ -85,9 +85,10 @@ class Options(RunOptions):
     defines the scores.
     """
 
-    sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|P-long|Q-long|P-turn|CAPTURE...")]
+    sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET|CAPTURE...")]
     """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same with 41 frames,
-    of which the last ten are scored. P-turn: people who turn. CAPTURE: each camera of a capture is
+    of which the last ten are scored. P-turn: people who turn. R48, R34: rigs of 48 and 34 cameras, as in the paper;
+    one frame with a full window is scored, also of glTF people with --performers. CAPTURE: each camera of a capture is
     held out in turn; or a file of `viewmend splits`, whose test scenes are used."""
     methods: str = "all"
     """Names separated by commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model,
@@ -216,6 +217,10 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
             f"{options.frames}; leave it out, or use P or Q"
         )
     frames = studio.LONG_FRAMES if name in LONG_SETS else options.frames or studio.FRAMES
+    if name == "R48" or name == "R34":
+        if options.frames is not None:
+            raise ValueError(f"expected no --frames with {name}, which scores one frame; leave it out")
+        return _one_in(options, studio.rig_set(name, options.performers, options.motions, options.size))
     if name == "P-turn":
         return _one_in(options, studio.turning_set(options.size))
     if name in ("P", "P-long", "Q", "Q-long"):

@@ -10,8 +10,12 @@ from viewmend.training.config import SceneConfig, TrainConfig
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from viewmend.training.run_files import Progress
 
+PARTED_DB = 0.2
+"""Gain on seen views over that on unseen ones, in dB, from which a run is said to memorise its samples."""
 DEFAULT = "views"
 """The recipe if none is named."""
 
@@ -120,4 +124,18 @@ def _line(progress: "Progress") -> str:
         f"step {progress.step}, {100 * progress.progress:.0f} %, {progress.eta_s / 60:.0f} min left: "
         f"L_in {progress.losses['inside']:.4f}, L_out {progress.losses['outside']:.4f}, "
         f"{progress.samples_per_s:.1f} samples/s, {100 * progress.waiting:.0f} % waiting"
+        f"{validation_text(progress.validation)}"
     )
+
+
+def validation_text(scores: "Mapping[str, float | None]") -> str:
+    """The scores of the latest validation on unseen and seen views, and a warning if they part; "" without any."""
+    unseen, seen, parted = (scores.get(name) for name in ("holes", "holes_seen", "parted"))
+    if unseen is None:
+        return ""
+    if seen is None:
+        return f"; validation {unseen:.2f} dB"
+    text = f"; validation {unseen:.2f} dB on unseen views, {seen:.2f} on seen ones"
+    if parted is not None and parted > PARTED_DB:
+        text += f" (seen views gained {parted:.2f} dB more: the run memorises its samples)"
+    return text

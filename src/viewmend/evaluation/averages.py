@@ -16,8 +16,12 @@ from viewmend.evaluation.scores import KINDS, MIN_HOLE_PX, ViewScores
 from viewmend.metrics.vfid import frechet_distance
 from viewmend.models.registry import REFERENCE
 
-REGIONS = ("holes_fg", "holes", "masked", "whole", "subject", "valid", "still", "past")
+REGIONS = ("holes_fg", "holes", "masked", "whole", "subject", "valid", "still", "sources", "others", "past")
 """Pixels that a score covers: the last part of its field's name."""
+MIN_ERROR_SCENES = 3
+"""Fewest scenes whose scores have a standard error."""
+ORIGINS = ("sources", "others", "past")
+"""Regions by what shows the surface of a hole (`PixelOrigins`)."""
 IRREGULAR = {
     "alpha_iou": ("alpha_iou", "whole"),
     "hull_iou": ("hull_iou", "whole"),
@@ -61,6 +65,13 @@ class Records:
     def mean(self, metric: str, region: str) -> float | None:
         """Mean over scenes, of the records of one method; None without any."""
         return mean(self.by_scene(metric, region).values())
+
+    def standard_error(self, metric: str, region: str) -> float | None:
+        """Standard error of `mean` over scenes; None for fewer than `MIN_ERROR_SCENES`."""
+        values = list(self.by_scene(metric, region).values())
+        if len(values) < MIN_ERROR_SCENES:
+            return None
+        return statistics.stdev(values) / len(values) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -160,9 +171,10 @@ def frames_with_holes(frames: Sequence[ViewScores]) -> list[ViewScores]:
 def _records_of_cell(cell: Cell) -> Iterator[Record]:
     facts = cell.key.scene, cell.set, cell.rig, cell.style, cell.key.method
     inside = [frame for frame in cell.frames if frame.hole_fg_px >= MIN_HOLE_PX]
-    past = [frame for frame in cell.frames if frame.past_px >= MIN_HOLE_PX]
     holes = frames_with_holes(cell.frames)
-    enough = {"holes": holes, "masked": holes, "fg": inside, "past": past}  # by the last word of a field's name
+    enough = {"holes": holes, "masked": holes, "fg": inside}  # by the last word of a field's name
+    for origin in ORIGINS:
+        enough[origin] = [frame for frame in cell.frames if getattr(frame, f"{origin}_px") >= MIN_HOLE_PX]
     names = [f.name for f in fields(ViewScores) if f.name != "time" and not f.name.endswith("_px")]
     figures = {
         _metric_and_region(name): mean(getattr(frame, name) for frame in enough.get(name.split("_")[-1], cell.frames))
@@ -171,9 +183,25 @@ def _records_of_cell(cell: Cell) -> Iterator[Record]:
     figures["hole_fraction", "hull"] = mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in cell.frames)
     figures["hole_fraction", "image"] = mean(f.hole_px / f.image_px for f in cell.frames)
     figures["hole_fraction", "only_past"] = mean(f.past_px / f.hole_fg_px for f in inside)
+    for kind, count in _composition(holes).items():
+        figures["share_of_holes", kind] = count
     for (metric, region), value in figures.items():
         if value is not None:
             yield Record(*facts, region, metric, value)
+
+
+def _composition(frames: Sequence[ViewScores]) -> dict[str, float | None]:
+    """What the holes are made of: mean fractions over the frames; nothing if it is not known."""
+    if not any(f.sources_px or f.others_px or f.past_px for f in frames):
+        return {}
+    counts = {
+        "phantom": lambda f: f.hole_px - f.hole_fg_px,
+        "sources": lambda f: f.sources_px,
+        "others": lambda f: f.others_px,
+        "past": lambda f: f.only_past_px,
+        "sources_past": lambda f: f.past_px,
+    }
+    return {kind: mean(count(f) / f.hole_px for f in frames) for kind, count in counts.items()}
 
 
 def _metric_and_region(name: str) -> tuple[str, str]:

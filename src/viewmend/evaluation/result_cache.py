@@ -26,7 +26,7 @@ from viewmend.utils.atomic_writes import write_atomically, write_text
 from viewmend.utils.contact_sheet import Picture
 from viewmend.utils.untrusted_input import typed
 
-PROTOCOL = 5
+PROTOCOL = 6
 """Increased whenever synthetic scenes, renderer or scores change, so that old cells are not mixed with new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
 DAMAGED += (RuntimeError, MemoryError, SyntaxError, TokenError, OverflowError)  # NotImplementedError is a RuntimeError

@@ -130,12 +130,13 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
     for frame in (to_device(own, settings.device) for own in scene.frames()):
         stream = Stream(Unfilled(), config, frame.bounds)
-        target_mask, carving = revealed(settings.protocol, frame.truth)
+        target_mask, own = revealed(settings.protocol, frame.truth)
+        carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)
         view = stream.render(frame.truth.cameras, target_mask=target_mask)
         holes, scored = int(view.holes.sum()), frame.inputs.time >= scene.scored_from
-        past = None if frame.seen is None else frame.seen.by_past_alone(view.source_views)
-        truth = true_view(frame.truth, settings.background, frame.backward_flow_px, past)
+        origins = None if frame.seen is None else frame.seen.origins(view.source_views)
+        truth = true_view(frame.truth, settings.background, frame.backward_flow_px, origins)
         last = _Frame(cached, frame.bounds, view, truth, scored, last, scored and holes > most)
         yield last
         most, last = max(most, holes) if scored else most, replace(last, previous=None)

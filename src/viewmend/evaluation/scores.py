@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from viewmend.metrics.image_quality import SsimWindow, change, mask_iou, psnr, s
 from viewmend.metrics.lpips import load_lpips
 from viewmend.metrics.vfid import MODES, I3d, load_i3d, video_features
 from viewmend.models.compositing import Background, camera_image, composite
+from viewmend.scenes.true_visibility import PixelOrigins
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.weight_files import MissingWeightsError
 
@@ -96,8 +98,14 @@ class ViewScores:
     """Pixels that the geometry proxy covers."""
     hole_px: int
     hole_fg_px: int
+    sources_px: int = 0
+    """Holes whose surface a source camera sees now, although the proxy hides it (`psnr_sources`)."""
+    others_px: int = 0
+    """Holes whose surface only cameras besides the sources see now (`psnr_others`)."""
     past_px: int = 0
-    """Holes that only the past shows (`psnr_past`)."""
+    """Holes whose surface no source camera sees now and one saw earlier (`psnr_past`)."""
+    only_past_px: int = 0
+    """Those of `past_px` that no other camera sees now either."""
     psnr_whole: float
     psnr_whole_rendered: float
     """`psnr_whole` of the view before inpainting."""
@@ -108,6 +116,10 @@ class ViewScores:
     psnr_holes: float | None = None
     psnr_holes_fg: float | None = None
     psnr_masked: float | None = None
+    psnr_sources: float | None = None
+    """PSNR over the holes whose surface a source view sees now."""
+    psnr_others: float | None = None
+    """PSNR over the holes whose surface no source view sees now, but another camera of the rig does."""
     psnr_past: float | None = None
     """PSNR over the holes whose surface no source view sees now and one saw earlier in the window."""
     ssim_whole: float | None = None
@@ -151,8 +163,8 @@ class TrueView:
     mask: Bool[Tensor, "height width"]
     backward_flow_px: Float[Tensor, "height width 2"] | None = None
     """Position of each pixel's surface point in the previous true image; None if unknown."""
-    by_past_alone: Bool[Tensor, "height width"] | None = None
-    """Pixels whose surface the source views saw only in the past (`SurfaceSeen.by_past_alone`); None if unknown."""
+    origins: PixelOrigins | None = None
+    """What shows the surface in each pixel (`SurfaceSeen.origins`); None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -167,12 +179,12 @@ def true_view(
     frame: MultiViewFrame,
     background: Background = "black",
     backward_flow_px: Float[Tensor, "height width 2"] | None = None,
-    by_past_alone: Bool[Tensor, "height width"] | None = None,
+    origins: PixelOrigins | None = None,
 ) -> TrueView:
     """The image of a camera (a frame of one view with a mask), composited on a background by its mask."""
     assert frame.mask is not None, "held-out cameras have masks"
     rgb = camera_image(frame, background)
-    return TrueView(rgb, frame.mask[0] > FOREGROUND, backward_flow_px, by_past_alone)
+    return TrueView(rgb, frame.mask[0] > FOREGROUND, backward_flow_px, origins)
 
 
 def score_view(
@@ -183,7 +195,6 @@ def score_view(
     rgb = composite(background, completed.rgb, completed.opacity)
     rendered = composite(background, view.cut_rgb, view.silhouette)
     hull, holes = view.mask > 0.5, view.holes
-    past = torch.zeros_like(holes) if truth.by_past_alone is None else truth.by_past_alone & holes
     height, width = holes.shape
     whole, whole_rendered = psnr(rgb, truth.rgb), psnr(rendered, truth.rgb)
     assert whole is not None and whole_rendered is not None, "images have pixels"
@@ -199,7 +210,6 @@ def score_view(
         hull_px=int(hull.sum()),
         hole_px=int(holes.sum()),
         hole_fg_px=int((holes & truth.mask).sum()),
-        past_px=int(past.sum()),
         psnr_whole=whole,
         psnr_whole_rendered=whole_rendered,
         psnr_subject=psnr(rgb, truth.rgb, truth.mask),
@@ -207,12 +217,26 @@ def score_view(
         psnr_holes=psnr(rgb, truth.rgb, holes),
         psnr_holes_fg=psnr(rgb, truth.rgb, holes & truth.mask),
         psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
-        psnr_past=psnr(rgb, truth.rgb, past),
         alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
         hull_iou=mask_iou(hull, truth.mask),
         **by_map,
+        **({} if truth.origins is None else _by_origin(rgb, truth.rgb, holes, truth.origins)),
         **({} if previous is None else _temporal(rgb, view, truth, previous)),
     )
+
+
+def _by_origin(
+    rgb: Float[Tensor, "3 height width"],
+    truth: Float[Tensor, "3 height width"],
+    holes: Bool[Tensor, "height width"],
+    origins: PixelOrigins,
+) -> dict[str, Any]:
+    """PSNR and numbers of the holes by what shows their surface."""
+    found: dict[str, Any] = {"only_past_px": int((holes & origins.past).sum())}
+    for name, seen in (("sources", origins.sources), ("others", origins.others), ("past", origins.sources_past)):
+        found[f"{name}_px"] = int((holes & seen).sum())
+        found[f"psnr_{name}"] = psnr(rgb, truth, holes & seen)
+    return found
 
 
 def mean_over_frames(values: Sequence[float | None], pixels: Sequence[int] | None = None) -> float | None:

@@ -66,6 +66,8 @@ class LeaveOneOutFrame:
     """What that camera saw (one view), with its mask."""
     bounds: Bounds | None
     """The volume that may hold the subject, None to find it."""
+    carving: Silhouettes | None = None
+    """Masks of more cameras of the rig, which carve the hull, and whose images are not drawn."""
     backward_flow_px: Float[Tensor, "height width 2"] | None = None
     """Where in the previous true image each pixel's surface point was (`backward_flow`); None if unknown."""
     seen: SurfaceSeen | None = None

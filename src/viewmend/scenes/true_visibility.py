@@ -11,7 +11,6 @@ from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.geometry.sampling import in_view
-from viewmend.types import MultiViewFrame
 
 VISIBLE_M = 0.02
 """A surface point was seen if it lay at most this much behind the depth of the pixel it fell into."""
@@ -47,10 +46,24 @@ class TrueSurface:
     """True z-depth, metres, in half precision: a step at 4 m is 4 mm, and `VISIBLE_M` is more."""
 
     @classmethod
-    def of(cls, frame: MultiViewFrame, mesh: Mesh) -> "TrueSurface":
-        """The surface of a frame with true depth."""
-        assert frame.depth is not None, "studio frames have depth"
-        return cls(mesh.vertices, frame.cameras, frame.depth.half())
+    def of(cls, mesh: Mesh, cameras: Cameras, depth: Float[Tensor, "view height width"] | None = None) -> "TrueSurface":
+        """The surface, and its true depth in these cameras, which is rendered unless it is given."""
+        depth = rasterize(mesh, cameras).depth if depth is None else depth
+        return cls(mesh.vertices, cameras, depth.half())
+
+
+@dataclass(frozen=True)
+class PixelOrigins:
+    """What shows the surface that each pixel of a true view shows; a pixel is in one of the three masks at most."""
+
+    sources: Bool[Tensor, "height width"]
+    """A source camera of the rendered view sees the surface now."""
+    others: Bool[Tensor, "height width"]
+    """No source camera sees it now, but another camera of the rig does."""
+    past: Bool[Tensor, "height width"]
+    """No camera sees it now, but a source camera saw it in an earlier frame of the window."""
+    sources_past: Bool[Tensor, "height width"]
+    """No source camera sees it now, but one saw it earlier, whether or not another camera sees it now."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +74,26 @@ class SurfaceSeen:
     seen: Bool[Tensor, "time view height width"]
     """The view's own time first; False where the view shows no surface."""
 
-    def by_past_alone(self, names: Sequence[str]) -> Bool[Tensor, "height width"]:
-        """Pixels whose surface none of these cameras sees now, but one saw in another frame."""
-        by_any = self.seen[:, [self.names.index(name) for name in names]].any(1)
-        return by_any[1:].any(0) & ~by_any[0]
+    def origins(self, sources: Sequence[str]) -> PixelOrigins:
+        """The pixels by what shows their surface, for a view that `sources` colour."""
+        by_sources = self.seen[:, [self.names.index(name) for name in sources]].any(1)
+        now = by_sources[0]
+        before = by_sources[1:].any(0)
+        by_any = self.seen[0].any(0)
+        return PixelOrigins(now, by_any & ~now, before & ~by_any, before & ~now)
 
 
 def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh: Mesh, target: Cameras) -> SurfaceSeen:
     """What the cameras saw, at these times, of the surface that the view of the camera `target` shows.
 
-    `surfaces` are by time, and all have the same cameras. The view's own time is the first; `mesh` is the true surface
-    then.
+    `surfaces` are by time. The view's own time is the first and has all cameras; the others may have fewer, and what
+    these saw counts as unseen. `mesh` is the true surface at the view's own time.
     """
     raster = rasterize(mesh, target)
     pixels = torch.nonzero(raster.triangle[0] >= 0)
     index = tuple(pixels.unbind(1))
-    names, (height, width) = surfaces[times[0]].cameras.names, raster.triangle.shape[1:]
+    names = surfaces[times[0]].cameras.names
+    height, width = raster.triangle.shape[1:]
     seen = torch.zeros(len(times), len(names), height, width, dtype=torch.bool, device=pixels.device)
     for n, time in enumerate(times):
         surface = surfaces[time]
@@ -85,6 +102,6 @@ def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh
         column, row = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)
         there = surface.depth[torch.arange(len(uv), device=uv.device)[:, None], row, column].float()
         visible = inside & (there > 0) & (z - there < VISIBLE_M)
-        for view in range(len(names)):
-            seen[n, view][index] = visible[view]
+        for name, by_camera in zip(surface.cameras.names, visible, strict=True):
+            seen[n, names.index(name)][index] = by_camera
     return SurfaceSeen(names, seen)

@@ -1,5 +1,6 @@
 """What real stages get wrong, each switchable and seeded: colour, noise, compression, masks, calibration."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -87,6 +88,7 @@ def imperfect_frame(
     imperfections: Imperfections,
     seed: int,
     background: Float[Tensor, "view 3 height width"] | None = None,
+    numbers: Sequence[int] | None = None,
 ) -> MultiViewFrame:
     """A frame as a real stage would have captured it; its depth and calibration stay true.
 
@@ -95,6 +97,7 @@ def imperfect_frame(
         imperfections: what is wrong.
         seed: of the capture; the same seed, camera position and time give the same errors.
         background: what the images have behind the subject, linear light; only `spill` uses it.
+        numbers: the cameras' positions in the rig; None if the frame has the whole rig.
     """
     if imperfections == Imperfections():
         return frame
@@ -103,11 +106,25 @@ def imperfect_frame(
     for n, (width, height) in enumerate(frame.cameras.size_px.tolist()):
         image, cover = frame.rgb[n, :, :height, :width], frame.mask[n, :height, :width]
         behind = None if background is None else background[n, :, :height, :width]
-        seeds = (seed, n, frame.time)
+        seeds = (seed, n if numbers is None else numbers[n], frame.time)
         pad = (0, frame.rgb.shape[3] - width, 0, frame.rgb.shape[2] - height)
         rgb.append(torch.nn.functional.pad(_image(image, cover, behind, imperfections, seeds), pad))
         mask.append(torch.nn.functional.pad(_mask(cover, imperfections, seeds), pad))
     return replace(frame, rgb=torch.stack(rgb), mask=torch.stack(mask))
+
+
+def imperfect_masks(
+    masks: UInt8[Tensor, "view height width"],
+    imperfections: Imperfections,
+    seed: int,
+    time: int,
+    numbers: Sequence[int],
+) -> UInt8[Tensor, "view height width"]:
+    """The masks that `imperfect_frame` gives cameras of one size; `numbers` are their positions in the rig."""
+    if imperfections == Imperfections():
+        return masks
+    pairs = zip(masks, numbers, strict=True)
+    return torch.stack([_mask(mask, imperfections, (seed, number, time)) for mask, number in pairs])
 
 
 def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfections, seeds: Seeds) -> Picture:

@@ -4,8 +4,9 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, project
 from viewmend.geometry.mesh import Mesh
@@ -154,10 +155,7 @@ def render(
         background: what stands behind, linear light; black if None.
         samples_per_side: 2 gives masks in steps of a quarter.
     """
-    if samples_per_side < 1:
-        raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
-    K = cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None]
-    fine = replace(cameras, K=K, size_px=cameras.size_px * samples_per_side)
+    fine = _enlarged(cameras, samples_per_side)
     scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
     triangle, depth = rasterize(scene.mesh, fine).triangle, rasterize(scene.mesh, cameras).depth
     if background is None:
@@ -181,3 +179,18 @@ def render(
 
     parallel_for(draw, views * BANDS)
     return MultiViewFrame(cameras, rgb, mask, 0, depth)
+
+
+def render_masks(mesh: Mesh, cameras: Cameras, samples_per_side: int = 2) -> UInt8[Tensor, "view height width"]:
+    """The masks that `render` draws, without shading."""
+    covered = rasterize(mesh, _enlarged(cameras, samples_per_side)).triangle >= 0
+    share = avg_pool2d(covered[:, None].float(), samples_per_side)[:, 0]
+    return (255 * share).round().to(torch.uint8)
+
+
+def _enlarged(cameras: Cameras, samples_per_side: int) -> Cameras:
+    """Cameras with a pixel for each sample."""
+    if samples_per_side < 1:
+        raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
+    K = cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None]
+    return replace(cameras, K=K, size_px=cameras.size_px * samples_per_side)

@@ -20,6 +20,8 @@ RADIUS_M = 3.0
 """Distance of the cameras from the stage's axis, or from the subject in a dome."""
 HEIGHTS_M = (1.1, 1.8)
 """Heights of a ring's cameras above the floor, in turn."""
+LAYER_HEIGHTS_M = (0.4, 1.2, 2.2)
+"""Heights of a layered rig's cameras above the floor, in turn: low, middle and high, as in DNA-Rendering."""
 DOME_RAD = (0.0, 1.2)
 """Elevations above the horizon between which a dome's cameras stand."""
 UP = (0.0, 1.0, 0.0)
@@ -27,8 +29,18 @@ UP = (0.0, 1.0, 0.0)
 
 def ring_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
     """Cameras all around the stage, at alternating heights, with errors as of careful hands (degrees, centimetres)."""
+    return _around(count, HEIGHTS_M, size_px, seed)
+
+
+def layered_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
+    """Cameras all around the stage in three layers, placed with the same errors as those of a ring."""
+    return _around(count, LAYER_HEIGHTS_M, size_px, seed)
+
+
+def _around(count: int, heights_m: Sequence[float], size_px: tuple[int, int], seed: int) -> Cameras:
+    """Cameras at equal angles around the stage, whose heights alternate."""
     azimuth = torch.arange(_positive(count)) * 2 * math.pi / count
-    height = torch.tensor([HEIGHTS_M[n % 2] for n in range(count)])
+    height = torch.tensor([heights_m[n % len(heights_m)] for n in range(count)])
     eyes = torch.stack([RADIUS_M * azimuth.sin(), height, RADIUS_M * azimuth.cos()], -1)
     return _stand(eyes, size_px, seed)
 

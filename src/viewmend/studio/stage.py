@@ -1,5 +1,6 @@
 """The studio: performers, lights and cameras as a capture with exact truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +14,11 @@ from torch import Tensor
 from viewmend.data.errors import CaptureError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.studio.imperfections import Imperfections, imperfect_cameras, imperfect_frame
+from viewmend.studio.imperfections import Imperfections, imperfect_cameras, imperfect_frame, imperfect_masks
 from viewmend.studio.performer import Performer, TexturedMesh, TexturePyramid, texture_pyramid
-from viewmend.studio.render import Surface, light, render, stage_backdrop, stage_lights
-from viewmend.studio.rigs import dome_rig, ring_rig
-from viewmend.types import MultiViewFrame
+from viewmend.studio.render import Surface, light, render, render_masks, stage_backdrop, stage_lights
+from viewmend.studio.rigs import dome_rig, layered_rig, ring_rig
+from viewmend.types import MultiViewFrame, Silhouettes
 from viewmend.utils.srgb import linear_from_srgb, srgb_from_linear
 
 BOUNDS_SAMPLES = 48
@@ -33,8 +34,8 @@ class StudioConfig:
     kept for tests and evaluation."""
     cameras: int | Cameras = 12
     """How many cameras the rig has, or the rig itself, in the stage's world."""
-    rig: Literal["ring", "dome"] = "ring"
-    """How a number of cameras is placed."""
+    rig: Literal["ring", "dome", "layers"] = "ring"
+    """How a number of cameras is placed: in a ring, on a dome, or in three layers."""
     frames: int = 30
     """Length of the capture."""
     size_px: int | tuple[int, int] = 512
@@ -76,7 +77,7 @@ class Studio:
         seeds = map(int, np.random.SeedSequence(config.seed).generate_state(5))
         performer_seed, rig_seed, light_seed, self._backdrop_seed, self._error_seed = seeds
         self.performer = performer or _cast(config, performer_seed)
-        rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
+        rig = {"ring": ring_rig, "dome": dome_rig, "layers": layered_rig}[config.rig]
         given = config.cameras
         self.name = f"studio {config.seed}: {self.performer.description}"
         self.frame_ids = tuple(f"{time:06d}" for time in range(config.frames))
@@ -112,17 +113,41 @@ class Studio:
         """The performers' surface at index `time`, which may lie beyond the capture's frames."""
         return self.performer.pose(time / self.config.fps)
 
-    def read(self, time: int) -> MultiViewFrame:
-        """All cameras at index `time`: images and masks with the imperfections, and the true depth.
+    def read(self, time: int, names: Sequence[str] | None = None) -> MultiViewFrame:
+        """The cameras at index `time`: images and masks with the imperfections, and the true depth.
+
+        Only the cameras of these `names` are drawn; None draws all. A camera's image does not depend on the others.
 
         Raises:
             IndexError: `time` is not in the capture.
         """
+        self._check_time(time)
+        names = self.cameras.names if names is None else tuple(names)
+        numbers = self._numbers(names)
+        backdrop = None if self._backdrop is None else self._backdrop[numbers]
+        frame = self._draw(self.true_cameras.select(names), time, backdrop)
+        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, backdrop, numbers)
+        return replace(frame, cameras=self.cameras.select(names))
+
+    def silhouettes(self, time: int, names: Sequence[str]) -> Silhouettes:
+        """The masks alone of some cameras at index `time`, equal to those of `read`, at a fifth of the cost.
+
+        Raises:
+            IndexError: `time` is not in the capture.
+        """
+        self._check_time(time)
+        masks = render_masks(self.scene(time).mesh, self.true_cameras.select(names), self.config.samples_per_side)
+        numbers = self._numbers(names)
+        masks = imperfect_masks(masks, self.config.imperfections, self._error_seed, time, numbers)
+        return Silhouettes(masks, self.cameras.select(names))
+
+    def _check_time(self, time: int) -> None:
         if not 0 <= time < self.config.frames:
             raise IndexError(f"expected a time from 0 to {self.config.frames - 1}, got {time}")
-        frame = self._draw(self.true_cameras, time, self._backdrop)
-        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
-        return replace(frame, cameras=self.cameras)
+
+    def _numbers(self, names: Sequence[str]) -> list[int]:
+        """Positions of these cameras in the rig."""
+        return [self.cameras.names.index(name) for name in names]
 
     def truth(self, cameras: Cameras, time: int, on_stage: bool = False) -> MultiViewFrame:
         """What perfect cameras anywhere would see at index `time`, with exact mask and depth.

@@ -34,6 +34,10 @@ class SceneConfig:
     """Edge lengths of the images; each scene uses one of them."""
     cameras: tuple[int, int] = (5, 20)
     """Smallest and largest number of cameras in a studio rig."""
+    rigs: Annotated[tuple[Literal["ring", "dome", "layers"], ...], HIDDEN] = ("ring", "dome")
+    """How the cameras of studio rigs are placed; of several ways, one is drawn for each rig."""
+    shared_hull: Annotated[bool, HIDDEN] = False
+    """Whether a quarter of each studio rig's cameras are held out together, and share the hull of the others."""
     num_holdout_views: int = 4
     """Cameras of a scene that are held out, one after the other, to serve as ground truth."""
     imperfect_fraction: float = 0.6

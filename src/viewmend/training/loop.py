@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -218,6 +218,7 @@ class Run:
         self.optimizer = self.objective.make_optimizer(self.trained, config.learning_rate)
         self.adversary = self.objective.adversary
         self.state = RunState(0, 0.0, ())
+        self.validated: dict[str, float | None] = {}
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
         if self.adversary is not None:
@@ -237,8 +238,9 @@ class Run:
         config, clock = self.config, Clock(self.config, self.state.step, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
             step = first = self.state.step
-            if self.keeps_best and step == 0:
-                self._validate(log, step)  # the weights that the run starts from are kept if none are better
+            if step == 0 and self.validation is not None and (self.keeps_best or self.objective.compares_seen):
+                # The weights that the run starts from are kept if none are better, and later gains are over theirs.
+                self._validate(log, step)
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
                 # A checkpoint that is older than the best weights would let worse ones replace them.
@@ -256,7 +258,7 @@ class Run:
                 losses = self._step(step, batches)
                 step += 1
                 pace = clock.pace(step, sum(map(len, batches)) * self.own.count)
-                entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace)
+                entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace, self.validated)
                 log.add(entry)
                 if self.validation is not None and step % config.validate_every == 0:
                     self._validate(log, step)
@@ -277,7 +279,10 @@ class Run:
         """Log the scores of the averaged weights; in runs that keep the best weights, write them if they are."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
+        first = log.first_validation() or scores
+        scores |= {"parted": seen_minus_unseen(scores, first)} if "holes_seen" in scores else {}
         log.add_validation(step, scores)
+        self.validated = scores
         score, best = scores.get("score"), self.state.best_score
         if self.keeps_best and score is not None and (best is None or score >= best + MIN_GAIN_DB):
             self.state = replace(self.state, best_score=score, best_step=step)
@@ -375,6 +380,20 @@ class Run:
     def _write_model(self, step: int | None = None) -> None:
         state = self.state if step is None else replace(self.state, step=step)
         self.objective.save(self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary))
+
+
+def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:
+    """How much more a model has gained since its first validation on seen views than on unseen ones, dB.
+
+    None if a score is missing.
+    """
+    gains = []
+    for name in ("holes_seen", "holes"):
+        now, before = scores.get(name), first.get(name)
+        if now is None or before is None:
+            return None
+        gains.append(now - before)
+    return gains[0] - gains[1]
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:

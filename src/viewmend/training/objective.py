@@ -75,6 +75,8 @@ class Objective(nn.Module, Generic[Model]):
     adversary: Adversary | None = None
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
+    compares_seen = False
+    """Whether the validation also scores views that the run trains on, beginning with the weights it starts from."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()
@@ -171,7 +173,8 @@ def write_rows(rows: Images, path: Path) -> None:
 class HoleValidation:
     """PSNR in the holes of fixed views, of the model ("holes") and of OpenCV's Telea ("telea").
 
-    The views are made at the first validation.
+    With `seen`, the scenes that the run trains on, as many views of these are scored as well ("holes_seen" and
+    "telea_seen"): a model that memorises its samples gains more on them. The views are made at the first validation.
     """
 
     scenes: SceneSource[Sample]
@@ -179,25 +182,35 @@ class HoleValidation:
     complete: Callable[[nn.Module, Sample], Float[Tensor, "3 _h _w"]]
     """The model's completed view of a sample, on `background`."""
     background: Background
-    _samples: list[Sample] = field(default_factory=list)
+    seen: SceneSource[Sample] | None = None
+    _samples: dict[str, list[Sample]] = field(default_factory=dict)
 
     @torch.no_grad()
     def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
         """Score a model."""
-        if not self._samples:
-            samples = (sample for number in count() for sample in self.scenes.scene(number))
-            self._samples = list(islice(samples, self.num_views))
-        training, device = model.training, next(model.parameters()).device
+        sources = {"": self.scenes} if self.seen is None else {"": self.scenes, "_seen": self.seen}
+        training = model.training
         model.eval()
-        scores, rows, telea = [], [], Telea()
-        for sample in self._samples:
-            truth, holes = true_image(sample, self.background), sample.view.error > 0
-            completed = self.complete(model, to_device(sample, device)).float().clamp(0, 1).cpu()
-            context = ContextProvider(lambda *_: None)
-            filled, _ = telea.step_on(self.background, sample.view, context, telea.initial_state())
-            classical = composite(self.background, filled.rgb, filled.opacity)
-            scores.append([psnr(rgb, truth, holes) for rgb in (completed, classical)])
-            rows.append(torch.cat([sample.view.rgb, completed, truth], 2))
+        scores: dict[str, float | None] = {}
+        rows: list[Tensor] = []
+        for suffix, source in sources.items():
+            if suffix not in self._samples:
+                samples = (sample for number in count() for sample in source.scene(number))
+                self._samples[suffix] = list(islice(samples, self.num_views))
+            pairs = torch.tensor([self._score(model, sample, rows) for sample in self._samples[suffix]])
+            scores[f"holes{suffix}"], scores[f"telea{suffix}"] = pairs.mean(0).tolist()
         model.train(training)
         write_rows(rows, image)
-        return dict(zip(("holes", "telea"), torch.tensor(scores).mean(0).tolist(), strict=True))
+        return scores
+
+    def _score(self, model: nn.Module, sample: Sample, rows: list[Tensor]) -> tuple[float | None, float | None]:
+        """PSNR in the holes of the model and of Telea; appends a row of images."""
+        device = next(model.parameters()).device
+        truth = true_image(sample, self.background)
+        holes = sample.view.missing > 0
+        completed = self.complete(model, to_device(sample, device)).float().clamp(0, 1).cpu()
+        telea = Telea()
+        filled, _ = telea.step_on(self.background, sample.view, ContextProvider(lambda *_: None), telea.initial_state())
+        classical = composite(self.background, filled.rgb, filled.opacity)
+        rows.append(torch.cat([sample.view.rgb, completed, truth], 2))
+        return psnr(completed, truth, holes), psnr(classical, truth, holes)

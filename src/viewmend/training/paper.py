@@ -1,7 +1,7 @@
 """Training of the paper's transformer by the paper's objective (section 8)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
@@ -16,6 +16,7 @@ from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfi
 from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, image_loss, load_start
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
+from viewmend.training.shared_rigs import SharedRigScenes
 from viewmend.utils.options import HIDDEN
 
 WINDOW = (0, 10, 20, 27, 28, 29, 30)
@@ -29,6 +30,8 @@ SAMPLING = SamplingConfig(
 class PaperObjective(Objective[PatchTransformer]):
     """Section 8: L1 inside and outside the holes, on the network's own image Ftilde, and L_adv on Fhat."""
 
+    compares_seen = True
+
     def __init__(self, config: TrainConfig, options: "PaperObjectiveConfig", start: nn.Module | None) -> None:
         super().__init__(config, PatchTransformer(options.model))
         load_start(self.model, start)
@@ -36,8 +39,15 @@ class PaperObjective(Objective[PatchTransformer]):
         if options.adversarial:
             self.loss_summary += f", {options.adversarial:g} x adversarial"
             self.adversary = Adversary(Discriminator("image"), GAN, options.adversarial, options.discriminator_rate)
-        scenes = validation_scenes(config.scenes, options.sampling)
-        self.validation = HoleValidation(scenes, config.validation_views, _complete, options.model.background)
+        self.validation = HoleValidation(
+            unseen_scenes(config.scenes, options.sampling),
+            config.validation_views,
+            _complete,
+            options.model.background,
+            self.training_scenes(f"{config.seed}/0"),
+        )
+        if not options.train_encoder:
+            self.model.tokeniser.requires_grad_(False)
 
     def forward(self, batch: Sequence[Sample]) -> StepOutput:
         """All terms of a batch of samples of any sizes."""
@@ -63,10 +73,21 @@ class PaperObjectiveConfig(ObjectiveConfig):
     """Weight lambda_adv of the adversarial loss; 0 trains without a discriminator."""
     discriminator_rate: float = 1e-4
     """Learning rate of the discriminator."""
+    train_encoder: bool = True
+    """Train the encoder as well. Without it a step takes half the time: the encoder needs no gradients."""
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[Sample]:
         """See `ObjectiveConfig.make_scenes`."""
+        if scenes.shared_hull and not scenes.captures:
+            return SharedRigScenes(scenes, self.sampling, seed)
         return sample_scenes(scenes, self.sampling, seed)
+
+
+def unseen_scenes(scenes: SceneConfig, sampling: SamplingConfig) -> SceneSource[Sample]:
+    """Samples of procedural people reserved for validation, from rigs like those of the training."""
+    if scenes.shared_hull:
+        return SharedRigScenes(replace(scenes, num_holdout_views=3), sampling, "validation", "validation")
+    return validation_scenes(scenes, sampling)
 
 
 def paper_image_loss(

@@ -15,6 +15,17 @@ from viewmend.utils.plugins import import_object
 
 PROTOCOLS = ("target-mask", "hull-with-target-mask", "strict")
 """What the paper's model may know of the held-out mask in training."""
+MOSTLY_GIVEN = ("target-mask", "target-mask", "target-mask", "hull-with-target-mask", "strict")
+"""Protocols of `paper-small`, one of which is drawn for each rig."""
+SMALL_RIGS = SceneConfig(
+    sizes_px=(224, 320, 416),
+    cameras=(6, 24),
+    num_holdout_views=6,
+    imperfect_fraction=0.5,
+    protocols=PROTOCOLS,
+    captures_fraction=1.0,
+)
+"""Rings and domes of few cameras, for fine-tuning `paper-small` next to captures."""
 SUBJECT_SCENES = SceneConfig(
     sizes_px=(224, 320, 416, 576), num_holdout_views=5, imperfect_fraction=0.8, hard_fraction=0.5
 )
@@ -76,23 +87,30 @@ def paper() -> TrainConfig:
 def paper_small() -> TrainConfig:
     """The paper's model and objective at smaller widths; for two CPU cores.
 
-    Nine scenes of ten have no past frames: a whole window takes eight times as long, and teaches little more.
+    Rigs are as large as the paper's, and each sample is seen once. Nine scenes of ten have no past frames: a whole
+    window takes eight times as long.
     """
-    sampling = replace(PaperObjectiveConfig().sampling, window_fraction=0.1)
+    sampling = replace(PaperObjectiveConfig().sampling, window_fraction=0.1, min_hole_px=100)
     return TrainConfig(
         name="paper-small",
         objective=PaperObjectiveConfig(model=paper_small_model(), sampling=sampling),
         scenes=SceneConfig(
-            sizes_px=(224, 320, 416),
-            cameras=(6, 24),
+            sizes_px=(512,),
+            cameras=(32, 60),
+            rigs=("layers", "layers", "dome"),
+            shared_hull=True,
             num_holdout_views=6,
-            imperfect_fraction=0.5,
-            protocols=PROTOCOLS,
+            imperfect_fraction=0.3,
+            protocols=MOSTLY_GIVEN,
             captures_fraction=1.0,
+            hull_resolution=128,
         ),
         steps=20_000,
-        new_per_batch=1,
+        new_per_batch=8,
+        replay_size=1,
         microbatch=1,
+        validation_views=12,
+        validate_every=200,
         learning_rate=6e-4,
         warmup=100,
         ema=0.998,
@@ -110,7 +128,7 @@ def finetune(start: str = "views") -> TrainConfig:
         config = views()
         objective = ViewsObjectiveConfig(model=model, coarse_from=start)
     elif isinstance(model, PaperConfig):
-        config = paper_small()
+        config = replace(paper_small(), scenes=SMALL_RIGS, replay_size=600)
         sampling = replace(PaperObjectiveConfig().sampling, min_history=0)  # captures may be short
         objective = PaperObjectiveConfig(model=model, sampling=sampling, adversarial=0.0)
     else:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,8 @@ class Progress:
     """Fraction of the time that was spent waiting for samples."""
     eta_s: float
     """Estimated time to the end."""
+    validation: dict[str, float | None] = field(default_factory=dict)
+    """The latest validation's scores; {} before the first."""
 
 
 def save_run(
@@ -188,6 +190,13 @@ class Log:
         """Log the scores of the averaged weights after a step."""
         self._write({"step": step, "validation": dict(scores)})
         self._plot(step, "validation", {name: score for name, score in scores.items() if score is not None})
+
+    def first_validation(self) -> dict[str, float | None]:
+        """The scores of the run's first validation; {} before it."""
+        if self._file is None:
+            return {}
+        entries = map(json.loads, self._path.read_text(encoding="utf-8").splitlines())
+        return next((entry["validation"] for entry in entries if "validation" in entry and "losses" not in entry), {})
 
     def _write(self, values: Mapping[str, object]) -> None:
         if self._file is not None:

@@ -16,7 +16,7 @@ from viewmend.rendering.view import RenderConfig
 from viewmend.scenes.held_out import LeaveOneOut, Protocol, revealed
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig, SceneConfig
-from viewmend.types import ContextViews, IncompleteView
+from viewmend.types import ContextViews, IncompleteView, MultiViewFrame
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,12 @@ def true_image(sample: Sample, background: Background) -> Float[Tensor, "3 heigh
     return composite(background, rgb, sample.alpha.float() / 255)
 
 
+def black_image(truth: MultiViewFrame) -> UInt8[Tensor, "3 height width"]:
+    """F* on black: the image of a frame of one view, times its mask."""
+    assert truth.mask is not None, "scenes for training have masks"
+    return (truth.rgb[0].float() * (truth.mask[0].float() / 255)).round().to(torch.uint8)
+
+
 class HeldOutCamera:
     """A rig without one of its cameras; the hull of each frame is computed once."""
 
@@ -88,9 +94,8 @@ class HeldOutCamera:
         ray_views = now.context(view.closest_views(sampling.num_ray_views))
         truth = known or self.rig.truth(self.held, time)
         assert truth.mask is not None, "scenes for training have masks"
-        black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
         seen = tuple(views for views in context if views is not None)
-        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0])
+        return Sample(view, seen, ray_views, black_image(truth), alpha=truth.mask[0])
 
 
 def rig_samples(

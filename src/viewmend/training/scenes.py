@@ -48,10 +48,7 @@ class StudioRigs:
 
         Raises ValueError if the split, or the config's characters or motions, are reserved for tests.
         """
-        if split == "test":
-            raise ValueError("expected the split training or validation, got test; use procedural_set")
-        people = [place for place in (config.performers, config.motions) if place is not None]
-        self.config = config if recordings(split, people) else replace(config, performers=None, motions=None)
+        self.config = training_people(config, split)
         self.frames = frames
         self.seed = seed
         self.split: Split = split
@@ -67,6 +64,18 @@ class StudioRigs:
         return Scene(LeaveOneOut({time: studio.read(time) for time in self.frames}, true_view=truth), random)
 
 
+def training_people(config: SceneConfig, split: Split) -> SceneConfig:
+    """The config with the characters and motions that a split may use.
+
+    Raises:
+        ValueError: the split is test, or the characters or motions are reserved for tests.
+    """
+    if split == "test":
+        raise ValueError("expected the split training or validation, got test; use procedural_set")
+    people = [place for place in (config.performers, config.motions) if place is not None]
+    return config if recordings(split, people) else replace(config, performers=None, motions=None)
+
+
 def random_studio(config: SceneConfig, frames: int, random: Random, split: Split = "training") -> StudioConfig:
     """A studio with random people, rig and imperfections, distributed as real studios differ."""
     flawed = random.random() < config.imperfect_fraction
@@ -74,7 +83,7 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
     studio = StudioConfig(
         seed=random.choice(PROCEDURAL_SEEDS[split]),
         cameras=random.randint(*config.cameras),
-        rig=random.choice(("ring", "dome")),
+        rig=random.choice(config.rigs),
         frames=frames,
         size_px=random.choice(config.sizes_px),
         background=random.choice(("black", "stage", "stage")) if flawed else "black",
