@@ -1,5 +1,5 @@
 #!/bin/sh
-# paper-small from random weights, on one CPU core and a worker: samples, patch autoencoder, the paper's objective; then
+# paper-small by the present recipe, which is not the one that made the shipped weights: from random weights, on one CPU core and a worker: samples, patch autoencoder, the paper's objective; then
 # three shorter runs, and the mean of all weights.
 #
 #     research/train_paper_small.sh OUT PEOPLE MOTIONS

@@ -17,7 +17,7 @@ from viewmend.training.objective import HoleValidation, ImageLoss, Objective, St
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
 from viewmend.training.shared_rigs import SharedRigScenes
-from viewmend.utils.options import HIDDEN
+from viewmend.utils.options import HIDDEN, NEGATED
 
 WINDOW = (0, 10, 20, 27, 28, 29, 30)
 """The paper's temporal window of frame 30: t, t - 1, t - 2, t - 3, t - 10, t - 20 and t - 30."""
@@ -73,8 +73,8 @@ class PaperObjectiveConfig(ObjectiveConfig):
     """Weight lambda_adv of the adversarial loss; 0 trains without a discriminator."""
     discriminator_rate: float = 1e-4
     """Learning rate of the discriminator."""
-    train_encoder: bool = True
-    """Train the encoder as well. Without it a step takes half the time: the encoder needs no gradients."""
+    train_encoder: Annotated[bool, NEGATED] = True
+    """Leave the encoder as it is, which takes half the time; for a run that starts from trained weights."""
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[Sample]:
         """See `ObjectiveConfig.make_scenes`."""
