@@ -2,8 +2,9 @@
 
 One frame of scenes in which a camera is left out. Each model runs with its own error rule. NAME@0.15 restricts it with
 the rule `predicted` to that share of the hull, and NAME@0 samples no camera, as in a moving live view. SET is P,
-Q:PERFORMERS, or CAPTURE:INPUTS, for example ../shared/captures/wd2:8. With a KIND other than hull, views of P and Q are
-rendered from other geometry: the exact mesh, a decimated one, splatted points, or a noisy depth map.
+Q:PERFORMERS, or CAPTURE:INPUTS, for example ../shared/captures/wd2:8. With the KIND fused, the
+hull is tightened by predicted depth. With any other KIND, views of P and Q are rendered from other geometry: the exact
+mesh, a decimated one, splatted points, or a noisy depth map.
 
 Columns: LPIPS in the subject's box; `sharpness`, the mean gradient of the view over that of the truth; `damaged`, the
 share of the pixels off by less than 0.05 as rendered that are off by more than 0.15 afterwards; `calibration`, the mean
@@ -35,12 +36,12 @@ from viewmend.models.compositing import composite
 from viewmend.models.registry import make_method
 from viewmend.rendering.view import RenderConfig, render_depth
 from viewmend.scenes.capture_scenes import capture_set
-from viewmend.scenes.held_out import LeaveOneOutScene
+from viewmend.scenes.held_out import LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
 from viewmend.training.views import CORRECT
-from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.types import CompletedView
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.weight_files import MissingWeightsError
 
@@ -55,7 +56,7 @@ SHOWN = (
     "psnr_holes",
     "alpha_iou",
 )
-PROXIES = ("hull", "exact", "decimated", "splats", "depth")
+PROXIES = ("hull", "fused", "exact", "decimated", "splats", "depth")
 CELL_M, POINTS = 0.05, 40_000
 """Of decimated meshes and splatted points."""
 NOISY = DepthErrors(noise_m=0.004, waves_m=0.008, step_m=0.008, holes=0.03)
@@ -73,7 +74,7 @@ def main() -> None:
     parser.add_argument(
         "--background", choices=("black", "white"), default="black", help="background of views and truth"
     )
-    parser.add_argument("--proxy", choices=PROXIES, default="hull", help="geometry behind which P and Q are rendered")
+    parser.add_argument("--proxy", choices=PROXIES, default="hull", help="geometry behind which views are rendered")
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each model")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
@@ -165,7 +166,7 @@ def completed_views(
     """The first frame of a scene by each model, and the truth."""
     frame = next(iter(scene.frames()))
     truth, target = true_view(frame.truth, options.background), frame.truth.cameras
-    geometry = None if options.proxy == "hull" else other_geometry(scene, frame.inputs, target, options.proxy, number)
+    geometry = other_geometry(scene, frame, target, options.proxy, number)
     for model in options.models:
         name, _, fraction = model.partition("@")
         part = float(fraction or 0)
@@ -184,9 +185,20 @@ def completed_views(
 
 
 def other_geometry(
-    scene: LeaveOneOutScene, inputs: MultiViewFrame, target: Cameras, kind: str, number: int
-) -> GeometryProxy | DepthMaps:
-    """The true surface of a studio scene as another renderer may know it; maps end with the novel view's."""
+    scene: LeaveOneOutScene, frame: LeaveOneOutFrame, target: Cameras, kind: str, number: int
+) -> GeometryProxy | DepthMaps | None:
+    """The fused geometry, or the true surface of a studio scene as another renderer may know it; None for the hull.
+
+    The names of depth maps end with the novel view's.
+    """
+    inputs = frame.inputs
+    if kind == "hull":
+        return None
+    if kind == "fused":
+        stream = Stream(make_method("views"), StreamConfig(memory_mb=None, geometry="fused"), frame.bounds)
+        proxy = stream.add_frame(inputs).proxy
+        assert isinstance(proxy, GeometryProxy)
+        return proxy
     assert isinstance(scene, StudioScene), "other geometry is for P and Q"
     studio = scene.studio()
     mesh, rng = studio.scene(0).mesh, torch.Generator().manual_seed(number)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from viewmend.frame_cache import CachedFrame, DepthProvider
     from viewmend.geometry.bounds import Bounds
     from viewmend.geometry.cameras import Cameras, pinhole
+    from viewmend.geometry.fusion import FusionConfig
     from viewmend.geometry.hull import HullConfig
     from viewmend.geometry.rigid import look_at
     from viewmend.live.client import Client, Publisher
@@ -44,6 +45,7 @@ __all__ = [
     "ContextViews",
     "DepthProvider",
     "Evidence",
+    "FusionConfig",
     "HullConfig",
     "IncompleteView",
     "Inpainter",
@@ -76,6 +78,7 @@ _NAMES = {
     "frame_cache": ("CachedFrame", "DepthProvider"),
     "geometry.bounds": ("Bounds",),
     "geometry.cameras": ("Cameras", "pinhole"),
+    "geometry.fusion": ("FusionConfig",),
     "geometry.hull": ("HullConfig",),
     "geometry.rigid": ("look_at",),
     "live.client": ("Client", "Publisher"),

@@ -152,16 +152,25 @@ def cache_frame(
     Raises:
         ValueError: the frame has no masks, a single camera, or cameras that look away from each other.
     """
+    device = frame.rgb.device
+    start = now_s(device)
+    masks = all_masks(frame, carving)
+    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, bounds, config))
+    return CachedFrame(frame, proxy, ms_since(start, device))
+
+
+def all_masks(frame: MultiViewFrame, carving: Silhouettes | None = None) -> Silhouettes:
+    """The masks that carve the hull: the frame's and those of more cameras, padded to the size of the largest.
+
+    Raises:
+        ValueError: the frame has no masks.
+    """
     if frame.mask is None:
         raise ValueError(
             "expected a capture with masks, got one without: the visual hull is computed from them; make "
             "them with viewmend masks CAPTURE OUT, or name their files as each camera's 'mask'"
         )
-    device = frame.rgb.device
-    start = now_s(device)
-    masks = Silhouettes(frame.mask, frame.cameras).joined(carving)
-    proxy = to_mmap(reconstruct(masks.mask, masks.cameras, bounds, config))
-    return CachedFrame(frame, proxy, ms_since(start, device))
+    return Silhouettes(frame.mask, frame.cameras).joined(carving)
 
 
 def evict(

@@ -10,14 +10,16 @@ import logging
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, check_provider, evict
+from viewmend.frame_cache import CachedFrame, DepthProvider, all_masks, cache_frame, check_provider, evict
+from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.fusion import FusionConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.threads import heavy_operations, light_operations
@@ -28,9 +30,14 @@ from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes, check_target_mask
 from viewmend.utils.cancellation import stop_if_cancelled
+from viewmend.utils.tensors import to_mmap
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 
 log = logging.getLogger("viewmend")
+
+
+Geometry = Literal["hull", "fused"]
+"""The kinds of geometry proxy that a stream computes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +50,12 @@ class StreamConfig:
         ()
     """
 
+    geometry: Geometry = "hull"
+    """The geometry proxy: the visual hull alone, or the hull fused with the depth that a model predicts."""
     hull: HullConfig = field(default_factory=HullConfig)
     """Parameters of the visual hull."""
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    """Parameters of the fused geometry."""
     render: RenderConfig = field(default_factory=RenderConfig)
     """How views are rendered, and which of their pixels are inpainted."""
     background: Background = "black"
@@ -55,6 +66,8 @@ class StreamConfig:
     encoded. None: frames are dropped once no temporal window reaches back to them."""
 
     def __post_init__(self) -> None:
+        if self.geometry not in get_args(Geometry):
+            raise ValueError(f"expected a geometry 'hull' or 'fused', got '{self.geometry}'")
         if self.background not in get_args(Background):
             raise ValueError(f"expected a background 'black' or 'white', got '{self.background}'")
         if self.memory_mb is not None and not self.memory_mb >= 0:
@@ -106,6 +119,7 @@ class Stream:
         config: StreamConfig | None = None,
         bounds: Bounds | None = None,
         error_model: Inpainter | None = None,
+        depth_model: Inpainter | None = None,
     ) -> None:
         """Create an empty stream.
 
@@ -115,9 +129,12 @@ class Stream:
             bounds: the volume that may contain the subject; None to find it from the masks.
             error_model: predicts errors in place of `inpainter`, if that does not; needed for the error rule
                 'predicted' and for `RenderQuality.refine_fraction` (`registry.error_model_for`).
+            depth_model: predicts depth in place of `inpainter`, if that does not; needed for the geometry 'fused'
+                (`registry.depth_model_for`).
 
         Raises:
-            ValueError: `inpainter` is a name, a class or anything else than an inpainter.
+            ValueError: `inpainter` is a name, a class or anything else than an inpainter; or the geometry is 'fused',
+                and no model predicts depth.
         """
         if not isinstance(inpainter, Inpainter):
             raise ValueError(
@@ -128,6 +145,12 @@ class Stream:
         self.config = config or StreamConfig()
         self.bounds = bounds
         self.error_model = error_model
+        self.depth_model = inpainter if inpainter.predicts_depth else depth_model
+        if self.config.geometry == "fused" and (self.depth_model is None or not self.depth_model.predicts_depth):
+            raise ValueError(
+                f"expected a model that predicts depth for the geometry 'fused', got {type(inpainter).__name__} alone; "
+                "give a depth_model: Stream(..., depth_model=load_inpainter('views')), or use the geometry 'hull'"
+            )
         self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
         self._warned = False
         """Whether a warning has said that the memory does not hold the window."""
@@ -139,7 +162,8 @@ class Stream:
 
     def with_render_config(self, render: RenderConfig) -> "Stream":
         """A stream with the same frames and memory, but another render configuration."""
-        other = Stream(self.inpainter, replace(self.config, render=render), self.bounds, self.error_model)
+        config = replace(self.config, render=render)
+        other = Stream(self.inpainter, config, self.bounds, self.error_model, self.depth_model)
         other._frames = self._frames
         return other
 
@@ -177,11 +201,24 @@ class Stream:
                 check_provider(geometry)
             images = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
             if geometry is None:
-                self._frames[frame.time] = cache_frame(images, self.bounds, self.config.hull, carving)
+                self._frames[frame.time] = self._with_geometry(images, carving)
             else:
                 self._frames[frame.time] = CachedFrame(images, geometry)
         self._use(frame.time)
         return self._frames[frame.time]
+
+    def _with_geometry(self, images: MultiViewFrame, carving: Silhouettes | None) -> CachedFrame:
+        """The frame with the geometry proxy that the configuration asks for."""
+        hull = cache_frame(images, self.bounds, self.config.hull, carving)
+        if self.config.geometry == "hull":
+            return hull
+        assert self.depth_model is not None
+        start = now_s(images.rgb.device)
+        masks = all_masks(images, carving)
+        proxy = fuse_geometry(hull, masks, self.depth_model, self.config.render, self.config.fusion)
+        fusion_ms = ms_since(start, images.rgb.device)
+        # What was encoded behind the hull does not belong to the new proxy.
+        return CachedFrame(images, to_mmap(proxy), hull.geometry_ms + fusion_ms)
 
     def adopt(self, cached: CachedFrame) -> CachedFrame:
         """Add a frame that another stream has prepared, with its geometry and everything computed from it so far.

@@ -95,6 +95,12 @@ class OccupancyGrid:
         shape = self.values.shape
         return GridSummary(blocks_read.view(blocks.shape), _box_of_lines(inside, shape), _box_of_lines(filled, shape))
 
+    @property
+    def cubes(self) -> "Cubes":
+        """The voxels without their values."""
+        x, y, z = self.values.shape
+        return Cubes(self.low, self.voxel_m, (x, y, z))
+
 
 @dataclass(frozen=True)
 class Cubes:
@@ -213,7 +219,7 @@ def _has_kernels(mask: Tensor) -> bool:
     return mask.device.type == "cpu"
 
 
-def _kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
+def kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
     """What the kernels take: P = K [R t], the lenses, the images' sizes, and the corner of the cubes."""
     K = cameras.K.double()
     lens = torch.stack([K[:, 0, 0] ** 2 + K[:, 0, 1] ** 2, K[:, 0, 2], K[:, 1, 1] ** 2, K[:, 1, 2]], -1)
@@ -228,7 +234,7 @@ def _carve_cpu(
 
     views, height, width = mask.shape
     rows, columns = -(-height // pool), -(-width // pool)
-    P, lens, size, low = _kernel_arrays(cameras, voxels)
+    P, lens, size, low = kernel_arrays(cameras, voxels)
     masks = mask.numpy()
     soft = np.empty((views, rows + 1, columns + 1), np.uint8)
     parallel_for(lambda view: kernels.soften(masks[view], *size[view, ::-1], pool, soft[view]), views)
@@ -255,7 +261,7 @@ def _occupied_cpu(
 ) -> Bool[Tensor, "x y z"]:
     from viewmend.geometry._hull_numba import occupied_blocks
 
-    P, lens, size, low = _kernel_arrays(cameras, blocks)
+    P, lens, size, low = kernel_arrays(cameras, blocks)
     occupied = torch.empty(blocks.shape, dtype=torch.bool)
     out = occupied.numpy()
     given = (P, lens, size, tile, sums, low, blocks.side_m, needed)

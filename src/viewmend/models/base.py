@@ -213,6 +213,17 @@ class ErrorMap(NamedTuple):
     """The gain that is left once the rendered colour is attenuated by `alpha`."""
 
 
+class DepthMap(NamedTuple):
+    """A model's prediction of the surface that a view shows."""
+
+    depth: Float[Tensor, "height width"]
+    """z-depth of the surface, metres; 0 far from the proxy."""
+    confidence: Float[Tensor, "height width"]
+    """How certain the depth is, in [0, 1]."""
+    alpha: Float[Tensor, "height width"]
+    """Coverage of each pixel by the subject, in [0, 1]; 0 far from the proxy."""
+
+
 class Inpainter:
     """Base class of everything that completes views. Override `step`; everything else has a default.
 
@@ -232,6 +243,8 @@ class Inpainter:
     """The background that its output is painted on. None: the background of its input, as for classical fills."""
     predicts_errors: bool = False
     """Whether `predict_errors` is implemented."""
+    predicts_depth: bool = False
+    """Whether `predict_depth` is implemented."""
     window_frames: int = 0
     """How many frames back `step` asks its context for. A stream keeps these frames, if its memory holds them."""
 
@@ -313,6 +326,10 @@ class Inpainter:
 
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """Predict which pixels of a rendered view are wrong; None if no camera is available."""
+        return None
+
+    def predict_depth(self, view: IncompleteView, context: ContextProvider) -> DepthMap | None:
+        """Predict the surface that a rendered view shows; None if no camera is available."""
         return None
 
 

@@ -94,6 +94,11 @@ def error_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | No
     return None if inpainter.predicts_errors else load_inpainter(ERROR_MODEL, device)
 
 
+def depth_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
+    """The model that predicts depth for the fused geometry: the shipped `views`; None if `inpainter` does it itself."""
+    return None if inpainter.predicts_depth else load_inpainter(ERROR_MODEL, device)
+
+
 def own_background(name: str) -> str | None:
     """The background that a model was made for, by its config; None for one without, and for other methods."""
     try:

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.threads import heavy_operations, light_operations
-from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
+from viewmend.models.base import ContextProvider, DepthMap, ErrorMap, RenderQuality, State
 from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
@@ -44,6 +44,7 @@ from viewmend.models.views.prediction import (
     DepthDistribution,
     SurfacePoints,
     ViewPrediction,
+    surface_mask,
     surface_points,
     unpremultiply,
 )
@@ -130,6 +131,7 @@ class ViewSynthNet(Network):
     trained_in_bfloat16 = True
     error_rule = "all"
     """The whole subject is predicted: the model learned to keep the pixels that are already correct."""
+    predicts_depth = True
 
     def __init__(self, config: ViewsConfig | None = None) -> None:
         super().__init__()
@@ -215,6 +217,24 @@ class ViewSynthNet(Network):
         if sources is None:
             return None
         return self.errors.predict(view, sources, context.quality)
+
+    @torch.no_grad()
+    @light_operations()
+    def predict_depth(self, view: IncompleteView, context: ContextProvider) -> DepthMap | None:
+        """The depth of the subject on the proxy and its rim, by the first half of the network: no colour is blended."""
+        sources = SourceCameras.closest_to(view, context, self.config.num_views)
+        if sources is None:
+            return None
+        guess = self.coarse_guess(view, sources, quick=True)
+        scale = SceneScale.of(view)
+        view = replace(view, depth=rim_depth(view.depth))
+        predicted = view.depth > 0
+        distribution = self._depth_distribution(view, sources, scale, predicted, ViewImage.of(view, guess, predicted))
+        pixels = torch.nonzero(predicted)
+        surface = surface_points(view.depth, scale, pixels, distribution)
+        alpha = surface_mask(surface, pixels, distribution)
+        found = torch.stack([surface.depth, surface.probability, alpha], 1)
+        return DepthMap(*scatter_to_image(found, pixels, view.mask.shape))
 
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
         """Computes the image pyramids of these cameras."""

@@ -1,0 +1,93 @@
+"""The geometry proxy of a frame, from its hull and the depth that a model predicts in views all around the subject."""
+
+import math
+
+import torch
+from torch.nn import functional as F
+
+from viewmend.frame_cache import CachedFrame
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
+from viewmend.geometry.fusion import DepthViews, FusionConfig, fuse_depth
+from viewmend.geometry.proxy import GeometryProxy
+from viewmend.geometry.virtual_cameras import surround
+from viewmend.models.base import ContextProvider, DepthMap, Inpainter, RenderQuality
+from viewmend.rendering.crop import grid_px, mesh_crop
+from viewmend.rendering.view import RenderConfig, render_view
+from viewmend.types import Silhouettes
+
+LEAST_SIDE_PX = 16
+"""The sides of the views whose depth is predicted have at least this many pixels."""
+
+
+def fuse_geometry(
+    cached: CachedFrame, masks: Silhouettes, model: Inpainter, render: RenderConfig, config: FusionConfig
+) -> GeometryProxy:
+    """The frame's hull, tightened by depth that the model predicts behind it.
+
+    Args:
+        cached: the frame with its hull.
+        masks: the masks that carved the hull.
+        model: predicts depth (`Inpainter.predicts_depth`).
+        render: how the views are rendered whose depth is predicted.
+        config: parameters of the fusion.
+
+    Returns:
+        The fused proxy, or the hull as it is where it is empty or no camera can be used.
+    """
+    hull = cached.proxy
+    assert isinstance(hull, GeometryProxy)
+    if not len(hull.mesh.vertices):
+        return hull
+    views = surround(cached.frame.cameras, hull.bounds.center, config.max_views, math.radians(config.min_angle_deg))
+    predicted = []
+    for number in range(len(views)):
+        camera = _resized(views[number], hull.bounds, config.view_px)
+        found = _predict(cached, camera, model, render)
+        if found is not None:
+            predicted.append(found)
+    if not predicted:
+        return hull
+    return fuse_depth(hull, masks.mask, masks.cameras, _stacked(predicted), config)
+
+
+def _resized(camera: Cameras, bounds: Bounds, view_px: int) -> Cameras:
+    """The camera with an image in which the longest side of a box spans about this many pixels, or its own if smaller.
+
+    A camera that is next to the box, or inside it, keeps its image.
+    """
+    depth_m = float(project(bounds.center[None], camera)[1])
+    side_m = float(bounds.size_m.max())
+    if depth_m < side_m / 2:
+        return camera
+    scale = min(1.0, view_px * depth_m / (side_m * float(camera.K[0, 0, 0])))
+    width, height = camera.max_size_px
+    return camera.resized(max(LEAST_SIDE_PX, round(scale * width)), max(LEAST_SIDE_PX, round(scale * height)))
+
+
+def _predict(
+    cached: CachedFrame, camera: Cameras, model: Inpainter, render: RenderConfig
+) -> tuple[Cameras, DepthMap] | None:
+    """The depth of the part of a view that shows the subject, and the camera of that part; None without cameras."""
+    proxy = cached.proxy
+    assert isinstance(proxy, GeometryProxy)
+    margin_px = model.crop_margin_px(RenderQuality()) or 0
+    crop = mesh_crop(proxy.mesh.vertices, camera, margin_px, grid_px(margin_px))
+    part = crop.of_camera(camera)
+    view, _ = render_view(cached.frame, proxy, part, render, (), cached.depth)
+    context = ContextProvider(lambda time, names: cached.context(names), memory=lambda time: cached.encoded)
+    found = model.predict_depth(view, context)
+    return None if found is None else (part, found)
+
+
+def _stacked(predicted: list[tuple[Cameras, DepthMap]]) -> DepthViews:
+    """All views in one, padded to the largest."""
+    height = max(found.depth.shape[0] for _, found in predicted)
+    width = max(found.depth.shape[1] for _, found in predicted)
+    cameras = concatenate_cameras([camera for camera, _ in predicted])
+    images = []
+    for _, found in predicted:
+        rows, columns = found.depth.shape
+        images.append(F.pad(torch.stack(found), (0, width - columns, 0, height - rows)))
+    depth, confidence, alpha = torch.stack(images, 1)
+    return DepthViews(cameras, depth, confidence, alpha)

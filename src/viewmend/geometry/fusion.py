@@ -1,0 +1,169 @@
+"""The visual hull, tightened by depth maps that a model predicted.
+
+A hull cannot be concave, and with few cameras it is too large. Depth maps are fused as in Curless and Levoy (SIGGRAPH
+1996): every voxel takes the weighted mean of its signed distances to the surfaces that the views see. What no view says
+anything about stays as the hull has it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras, project
+from viewmend.geometry.hull import HullConfig, OccupancyGrid, kernel_arrays, visual_hull
+from viewmend.geometry.hull_parts import without_floating_parts
+from viewmend.geometry.mesh import vertex_normals
+from viewmend.geometry.proxy import GeometryProxy
+from viewmend.geometry.sampling import in_view, sample_bilinear
+from viewmend.geometry.surface import extract_surface
+from viewmend.geometry.threads import light_operations, parallel_for
+from viewmend.utils.tensors import OnDevice
+
+LEAST_CONFIDENCE = 1e-3
+"""A depth with a lower confidence counts with this one, so that weights are never 0."""
+
+VOXELS_AT_ONCE = 2**18
+"""The number of voxels that are fused together on a device other than the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionConfig:
+    """How predicted depths are fused with the hull.
+
+    Examples:
+        >>> from viewmend import FusionConfig, StreamConfig
+        >>> StreamConfig(geometry="fused", fusion=FusionConfig(max_views=8)).fusion.max_views
+        8
+    """
+
+    resolution: int = 160
+    """Voxels along the longest side of the subject's box."""
+    max_views: int = 24
+    """Largest number of views whose depth is predicted: first cameras of the rig, then virtual ones in its gaps."""
+    min_angle_deg: float = 8.0
+    """Smallest angle between two of these views, as seen from the subject, in degrees."""
+    view_px: int = 240
+    """Pixels that the longest side of the subject's box spans in the views whose depth is predicted."""
+    truncation_voxels: float = 3.0
+    """Distance in front of a surface, in voxels, from which a voxel counts as empty, whatever its distance. Voxels that
+    are farther than this behind the surface that a view sees are hidden from it."""
+    confidence_power: float = 1.0
+    """Exponent of the confidence in a depth's weight."""
+    alpha_rank: int = 2
+    """The alpha of this rank, counted from the lowest one, bounds the occupancy: with 2, a single view that takes the
+    subject for background removes nothing. 0 leaves alpha aside."""
+
+
+@dataclass(frozen=True)
+class DepthViews(OnDevice):
+    """The subject's depth in some views, as a model predicts it. Images are padded right and below to the largest."""
+
+    cameras: Cameras
+    depth: Float[Tensor, "view height width"]
+    """z-depth of the surface, metres; 0 where a view says nothing."""
+    confidence: Float[Tensor, "view height width"]
+    """How certain the depth is, in [0, 1]."""
+    alpha: Float[Tensor, "view height width"]
+    """Coverage of each pixel by the subject, in [0, 1]."""
+
+
+@light_operations()
+def fuse_depth(
+    proxy: GeometryProxy,
+    mask: UInt8[Tensor, "view height width"],
+    cameras: Cameras,
+    views: DepthViews,
+    config: FusionConfig | None = None,
+) -> GeometryProxy:
+    """The hull of these masks, tightened by depth views, within the box of its proxy.
+
+    Args:
+        proxy: the hull's surface; only its box is used.
+        mask: the masks that carve the hull.
+        cameras: the masks' cameras.
+        views: depth in real or virtual views.
+        config: parameters of the fusion.
+
+    Raises:
+        ValueError: there are masks of one camera only.
+    """
+    config = config or FusionConfig()
+    hull = visual_hull(mask, cameras, proxy.bounds, HullConfig(resolution=config.resolution))
+    fused = without_floating_parts(fuse_occupancy(hull, views, config), cameras)
+    mesh = extract_surface(fused)
+    return GeometryProxy(mesh, vertex_normals(mesh), proxy.bounds)
+
+
+def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> OccupancyGrid:
+    """Occupancy after fusion: 1 inside, 0 outside, one half on the surface, and never above the hull's.
+
+    Each view that sees a voxel adds its signed distance to the surface along the axis of its camera, truncated in front
+    and weighted by the confidence. Behind the truncation, the view says nothing.
+    """
+    fuse = _fuse_numba if hull.values.device.type == "cpu" else _fuse_torch
+    return OccupancyGrid(fuse(hull, views, config), hull.low, hull.voxel_m)
+
+
+def _fuse_numba(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "x y z"]:
+    """The fused occupancy, by compiled loops on all threads."""
+    from viewmend.geometry._fusion_numba import fuse_slab
+
+    occupancy = hull.values.contiguous().numpy()
+    out = np.zeros_like(occupancy)
+    P, _, size_px, low = kernel_arrays(views.cameras, hull.cubes)
+    weight = views.confidence.float().clamp_min(LEAST_CONFIDENCE) ** config.confidence_power
+    images = [image.float().contiguous().numpy() for image in (views.depth, weight, views.alpha)]
+    numbers = (hull.voxel_m, config.truncation_voxels, config.alpha_rank)
+
+    def work(slab: int) -> None:
+        fuse_slab(slab, occupancy, P, size_px, low, *images, *numbers, out)
+
+    parallel_for(work, occupancy.shape[0])
+    return torch.from_numpy(out)
+
+
+def _fuse_torch(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "x y z"]:
+    """The fused occupancy, on any device."""
+    occupancy = hull.values.flatten()
+    filled = (occupancy > 0).nonzero()[:, 0]
+    centers = hull.cubes.centers[filled]
+    parts = [_fuse_points(points, hull.voxel_m, views, config) for points in centers.split(VOXELS_AT_ONCE)]
+    out = torch.zeros_like(occupancy)
+    if parts:
+        out[filled] = torch.minimum(occupancy[filled], torch.cat(parts))
+    return out.view(hull.values.shape)
+
+
+def _fuse_points(
+    points: Float[Tensor, "point 3"], voxel_m: float, views: DepthViews, config: FusionConfig
+) -> Float[Tensor, "point"]:
+    """The occupancy that the views leave at points in the hull."""
+    cameras = views.cameras
+    uv, z = project(points, cameras)
+    sees = in_view(uv, z, cameras)
+
+    # The depth and the confidence of the pixel that shows each point
+    last = (cameras.size_px - 1)[:, None]
+    pixel = torch.minimum(uv.nan_to_num(0.0).clamp_min(0).long(), last)
+    view = torch.arange(len(cameras), device=points.device)[:, None]
+    depth = views.depth[view, pixel[..., 1], pixel[..., 0]]
+    confidence = views.confidence[view, pixel[..., 1], pixel[..., 0]]
+
+    # The mean signed distance to the surfaces, in voxels
+    distance = (depth - z) / voxel_m
+    is_used = sees & (depth > 0) & (distance > -config.truncation_voxels)
+    weight = confidence.clamp_min(LEAST_CONFIDENCE) ** config.confidence_power * is_used
+    total = weight.sum(0)
+    mean = (weight * distance.clamp(max=config.truncation_voxels)).sum(0) / total.clamp_min(1e-12)
+    occupancy = torch.where(total > 0, (0.5 - 0.5 * mean).clamp(0, 1), 1.0)
+
+    # The views' alpha
+    rank = min(config.alpha_rank, len(cameras))
+    if rank:
+        alpha = sample_bilinear(views.alpha[:, None], uv, "border")[..., 0]
+        bound = torch.where(sees, alpha, 1.0).kthvalue(rank, dim=0).values
+        occupancy = torch.minimum(occupancy, bound)
+    return occupancy
