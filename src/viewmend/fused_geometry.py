@@ -89,5 +89,5 @@ def _stacked(predicted: list[tuple[Cameras, DepthMap]]) -> DepthViews:
     for _, found in predicted:
         rows, columns = found.depth.shape
         images.append(F.pad(torch.stack(found), (0, width - columns, 0, height - rows)))
-    depth, confidence, alpha = torch.stack(images, 1)
-    return DepthViews(cameras, depth, confidence, alpha)
+    depth, confidence = torch.stack(images, 1)
+    return DepthViews(cameras, depth, confidence)

@@ -6,11 +6,9 @@ from viewmend.utils.compiled import kernel
 
 
 @kernel
-def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, alpha, voxel_m, truncation_voxels, alpha_rank, out):
+def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, voxel_m, truncation_voxels, out):
     """Fuse the voxels of one slab along x into `out`, where the hull's occupancy is not 0."""
     views = P.shape[0]
-    rank = min(alpha_rank, views)
-    lowest = np.ones(max(rank, 1), np.float32)
     x = low[0] + (slab + 0.5) * voxel_m
     for j in range(occupancy.shape[1]):
         y = low[1] + (j + 0.5) * voxel_m
@@ -19,7 +17,6 @@ def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, alpha, voxel_m, t
             if hull <= 0:
                 continue
             z = low[2] + (k + 0.5) * voxel_m
-            lowest[:] = 1
             total = 0.0
             summed = 0.0
             for view in range(views):
@@ -32,8 +29,6 @@ def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, alpha, voxel_m, t
                 if u < 0 or v < 0 or u >= size_px[view, 0] or v >= size_px[view, 1]:
                     continue
 
-                if rank:
-                    insert(lowest, sample(alpha[view], u, v))
                 row = np.int64(v)
                 column = np.int64(u)
                 surface = depth[view, row, column]
@@ -47,35 +42,4 @@ def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, alpha, voxel_m, t
             fused = hull
             if total > 0:
                 fused = min(fused, max(0.0, 0.5 - 0.5 * summed / total))
-            if rank:
-                fused = min(fused, lowest[rank - 1])
             out[slab, j, k] = fused
-
-
-@kernel(inline="always")
-def insert(lowest, value):
-    """Insert a value into a sorted array, whose largest value drops out."""
-    at = len(lowest)
-    while at > 0 and value < lowest[at - 1]:
-        if at < len(lowest):
-            lowest[at] = lowest[at - 1]
-        at -= 1
-    if at < len(lowest):
-        lowest[at] = value
-
-
-@kernel(inline="always")
-def sample(image, u, v):
-    """The bilinear value of an image at a pixel position; beyond the border, that of the nearest pixel."""
-    height, width = image.shape
-    left = np.int64(np.floor(u - 0.5))
-    top = np.int64(np.floor(v - 0.5))
-    right_share = u - 0.5 - left
-    bottom_share = v - 0.5 - top
-    column = min(max(left, 0), width - 1)
-    next_column = min(max(left + 1, 0), width - 1)
-    row = min(max(top, 0), height - 1)
-    next_row = min(max(top + 1, 0), height - 1)
-    above = (1 - right_share) * image[row, column] + right_share * image[row, next_column]
-    below = (1 - right_share) * image[next_row, column] + right_share * image[next_row, next_column]
-    return (1 - bottom_share) * above + bottom_share * below

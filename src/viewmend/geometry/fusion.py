@@ -17,7 +17,7 @@ from viewmend.geometry.hull import HullConfig, OccupancyGrid, kernel_arrays, vis
 from viewmend.geometry.hull_parts import without_floating_parts
 from viewmend.geometry.mesh import vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.geometry.sampling import in_view, sample_bilinear
+from viewmend.geometry.sampling import in_view
 from viewmend.geometry.surface import extract_surface
 from viewmend.geometry.threads import light_operations, parallel_for
 from viewmend.utils.tensors import OnDevice
@@ -52,9 +52,6 @@ class FusionConfig:
     are farther than this behind the surface that a view sees are hidden from it."""
     confidence_power: float = 1.0
     """Exponent of the confidence in a depth's weight."""
-    alpha_rank: int = 2
-    """The alpha of this rank, counted from the lowest one, bounds the occupancy: with 2, a single view that takes the
-    subject for background removes nothing. 0 leaves alpha aside."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +63,6 @@ class DepthViews(OnDevice):
     """z-depth of the surface, metres; 0 where a view says nothing."""
     confidence: Float[Tensor, "view height width"]
     """How certain the depth is, in [0, 1]."""
-    alpha: Float[Tensor, "view height width"]
-    """Coverage of each pixel by the subject, in [0, 1]."""
 
 
 @light_operations()
@@ -115,11 +110,10 @@ def _fuse_numba(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) ->
     out = np.zeros_like(occupancy)
     P, _, size_px, low = kernel_arrays(views.cameras, hull.cubes)
     weight = views.confidence.float().clamp_min(LEAST_CONFIDENCE) ** config.confidence_power
-    images = [image.float().contiguous().numpy() for image in (views.depth, weight, views.alpha)]
-    numbers = (hull.voxel_m, config.truncation_voxels, config.alpha_rank)
+    images = [image.float().contiguous().numpy() for image in (views.depth, weight)]
 
     def work(slab: int) -> None:
-        fuse_slab(slab, occupancy, P, size_px, low, *images, *numbers, out)
+        fuse_slab(slab, occupancy, P, size_px, low, *images, hull.voxel_m, config.truncation_voxels, out)
 
     parallel_for(work, occupancy.shape[0])
     return torch.from_numpy(out)
@@ -158,12 +152,4 @@ def _fuse_points(
     weight = confidence.clamp_min(LEAST_CONFIDENCE) ** config.confidence_power * is_used
     total = weight.sum(0)
     mean = (weight * distance.clamp(max=config.truncation_voxels)).sum(0) / total.clamp_min(1e-12)
-    occupancy = torch.where(total > 0, (0.5 - 0.5 * mean).clamp(0, 1), 1.0)
-
-    # The views' alpha
-    rank = min(config.alpha_rank, len(cameras))
-    if rank:
-        alpha = sample_bilinear(views.alpha[:, None], uv, "border")[..., 0]
-        bound = torch.where(sees, alpha, 1.0).kthvalue(rank, dim=0).values
-        occupancy = torch.minimum(occupancy, bound)
-    return occupancy
+    return torch.where(total > 0, (0.5 - 0.5 * mean).clamp(0, 1), 1.0)

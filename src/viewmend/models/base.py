@@ -220,8 +220,6 @@ class DepthMap(NamedTuple):
     """z-depth of the surface, metres; 0 far from the proxy."""
     confidence: Float[Tensor, "height width"]
     """How certain the depth is, in [0, 1]."""
-    alpha: Float[Tensor, "height width"]
-    """Coverage of each pixel by the subject, in [0, 1]; 0 far from the proxy."""
 
 
 class Inpainter:

@@ -44,7 +44,6 @@ from viewmend.models.views.prediction import (
     DepthDistribution,
     SurfacePoints,
     ViewPrediction,
-    surface_mask,
     surface_points,
     unpremultiply,
 )
@@ -232,8 +231,7 @@ class ViewSynthNet(Network):
         distribution = self._depth_distribution(view, sources, scale, predicted, ViewImage.of(view, guess, predicted))
         pixels = torch.nonzero(predicted)
         surface = surface_points(view.depth, scale, pixels, distribution)
-        alpha = surface_mask(surface, pixels, distribution)
-        found = torch.stack([surface.depth, surface.probability, alpha], 1)
+        found = torch.stack([surface.depth, surface.probability], 1)
         return DepthMap(*scatter_to_image(found, pixels, view.mask.shape))
 
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:

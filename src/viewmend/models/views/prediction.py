@@ -181,17 +181,6 @@ def surface_points(
     return SurfacePoints(cell, best, shares.amax(1), offset, depth)
 
 
-def surface_mask(surface: SurfacePoints, pixels: Pixels, distribution: DepthDistribution) -> Float[Tensor, "pixel"]:
-    """The cameras' mean mask at the points that pixels show, in [0, 1].
-
-    It is the largest among the most probable depth hypothesis and its neighbours: between them, thin parts would fade.
-    """
-    masks = distribution.interpolate(distribution.samples.mask[..., 0].float(), pixels)
-    best = surface.hypothesis
-    around = torch.stack([best - 1, best, best + 1], 1).clamp(0, len(OFFSETS) - 1)
-    return masks.gather(1, around).amax(1).clamp(0, 1)
-
-
 def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
     """Small islands around the subject all of whose pixels are `predicted`; `colour` is their largest channel."""
     visible = (torch.maximum(colour, alpha) > ISLANDS.visible).cpu().numpy()

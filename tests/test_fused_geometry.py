@@ -1,0 +1,114 @@
+"""Streams whose geometry is fused from predicted depth."""
+
+import pytest
+import torch
+from reference.ball import camera_at, photograph, ring
+from reference.forged import forged
+
+from viewmend.frame_cache import all_masks, cache_frame
+from viewmend.fused_geometry import fuse_geometry
+from viewmend.geometry.fusion import FusionConfig
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.rasterize import rasterize
+from viewmend.models.base import DepthMap, Inpainter
+from viewmend.models.checkpoint import load_inpainter
+from viewmend.models.classical import Telea
+from viewmend.models.registry import depth_model_for
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
+
+SMALL = FusionConfig(resolution=96, max_views=12, view_px=96)
+FUSED = StreamConfig(geometry="fused", fusion=SMALL)
+
+
+class Moved(Inpainter):
+    """Predicts the proxy's depth, moved away by a distance, with full confidence."""
+
+    predicts_depth = True
+
+    def __init__(self, metres: float) -> None:
+        self.metres = metres
+        self.sizes: list[tuple[int, int]] = []
+
+    def predict_depth(self, view, context):
+        self.sizes.append(tuple(view.depth.shape))
+        inside = (view.depth > 0).float()
+        return DepthMap((view.depth + self.metres) * inside, inside)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return load_inpainter("views")
+
+
+def depth_error_m(proxy, target, truth) -> float:
+    """The mean error of the proxy's depth where it and the truth have a surface, up to 10 cm a pixel."""
+    found = proxy.depth(target)
+    both = (found > 0) & (truth > 0)
+    return float((found - truth)[both].abs().clamp(max=0.1).mean())
+
+
+def test_the_surface_of_a_person_gets_closer_to_the_truth(views):
+    studio = Studio(StudioConfig(seed=3, cameras=6, frames=1, size_px=(160, 160)))
+    frame = studio.read(0)
+    target = orbit([0.5], (200, 200), elevation_rad=0.3)
+    truth = rasterize(studio.scene(0).mesh, target).depth
+    hull = Stream(Telea(), bounds=studio.bounds).add_frame(frame)
+    fused = Stream(Telea(), FUSED, studio.bounds, depth_model=views).add_frame(frame)
+    assert depth_error_m(fused.proxy, target, truth) < 0.9 * depth_error_m(hull.proxy, target, truth)
+    assert fused.geometry_ms > hull.geometry_ms
+
+
+def test_the_hull_follows_the_depth_that_is_predicted():
+    frame = photograph(ring(6, 96))
+    cached = cache_frame(frame, None, HullConfig())
+    target = camera_at(77, "novel", 96)
+
+    def depth_m(model) -> float:
+        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), FusionConfig())
+        return float(proxy.depth(target)[0, 48, 48])
+
+    # Views from the side move the surface that faces the target by less than the full distance.
+    assert 0.008 < depth_m(Moved(0.02)) - depth_m(Moved(0.0)) < 0.02
+    assert 0.016 < depth_m(Moved(0.04)) - depth_m(Moved(0.0)) < 0.04
+
+
+def test_views_are_no_larger_than_asked_for_and_no_more():
+    model = Moved(0.0)
+    Stream(model, StreamConfig(geometry="fused", fusion=FusionConfig(max_views=9, view_px=40))).add_frame(
+        photograph(ring(6, 200))
+    )
+    assert len(model.sizes) == 9
+    assert all(height <= 96 and width <= 96 for height, width in model.sizes)
+
+
+def test_without_a_model_that_predicts_depth_it_is_refused():
+    with pytest.raises(ValueError, match=r"predicts depth for the geometry 'fused', got Telea alone"):
+        Stream(Telea(), FUSED)
+    with pytest.raises(ValueError, match="'hull' or 'fused', got 'mesh'"):
+        forged(StreamConfig(), geometry="mesh").__post_init__()
+
+
+def test_the_shipped_model_predicts_depth_for_those_that_do_not(views):
+    assert depth_model_for(views) is None
+    assert depth_model_for(Telea()).predicts_depth
+
+
+def test_a_frame_without_a_subject_shows_the_background(views):
+    frame = photograph(ring(4))
+    frame.mask.zero_()
+    stream = Stream(views, FUSED)
+    assert not len(stream.add_frame(frame).proxy.mesh.vertices)
+    assert not stream.view(camera_at(20, "novel")).completed.rgb.any()
+
+
+def test_completed_views_are_the_same_with_one_model_or_two(views):
+    frame = photograph(ring(6, 64))
+    target = camera_at(77, "novel", 64)
+    one = Stream(views, FUSED)
+    two = Stream(views, FUSED, depth_model=views)
+    one.add_frame(frame)
+    two.add_frame(frame)
+    assert torch.equal(one.view(target).completed.rgb, two.view(target).completed.rgb)
