@@ -13,7 +13,7 @@ from viewmend.geometry.rasterize import rasterize
 from viewmend.models.base import DepthMap, Inpainter
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import Telea
-from viewmend.models.registry import depth_model_for
+from viewmend.models.registry import error_model_for
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
@@ -56,7 +56,7 @@ def test_the_surface_of_a_person_gets_closer_to_the_truth(views):
     target = orbit([0.5], (200, 200), elevation_rad=0.3)
     truth = rasterize(studio.scene(0).mesh, target).depth
     hull = Stream(Telea(), bounds=studio.bounds).add_frame(frame)
-    fused = Stream(Telea(), FUSED, studio.bounds, depth_model=views).add_frame(frame)
+    fused = Stream(Telea(), FUSED, studio.bounds, error_model=views).add_frame(frame)
     assert depth_error_m(fused.proxy, target, truth) < 0.9 * depth_error_m(hull.proxy, target, truth)
     assert fused.geometry_ms > hull.geometry_ms
 
@@ -92,8 +92,8 @@ def test_without_a_model_that_predicts_depth_it_is_refused():
 
 
 def test_the_shipped_model_predicts_depth_for_those_that_do_not(views):
-    assert depth_model_for(views) is None
-    assert depth_model_for(Telea()).predicts_depth
+    assert error_model_for(views) is None
+    assert error_model_for(Telea()).predicts_depth
 
 
 def test_a_frame_without_a_subject_shows_the_background(views):
@@ -108,7 +108,7 @@ def test_completed_views_are_the_same_with_one_model_or_two(views):
     frame = photograph(ring(6, 64))
     target = camera_at(77, "novel", 64)
     one = Stream(views, FUSED)
-    two = Stream(views, FUSED, depth_model=views)
+    two = Stream(views, FUSED, error_model=views)
     one.add_frame(frame)
     two.add_frame(frame)
     assert torch.equal(one.view(target).completed.rgb, two.view(target).completed.rgb)

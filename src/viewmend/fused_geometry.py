@@ -39,10 +39,11 @@ def fuse_geometry(
     assert isinstance(hull, GeometryProxy)
     if not len(hull.mesh.vertices):
         return hull
-    views = surround(cached.frame.cameras, hull.bounds.center, config.max_views, math.radians(config.min_angle_deg))
+    on_host = cached.frame.cameras.on_host
+    views = surround(on_host, hull.bounds.on_host.center, config.max_views, math.radians(config.min_angle_deg))
     predicted = []
     for number in range(len(views)):
-        camera = _resized(views[number], hull.bounds, config.view_px)
+        camera = _resized(views[number], hull.bounds, config.view_px).to(cached.frame.rgb.device)
         found = _predict(cached, camera, model, render)
         if found is not None:
             predicted.append(found)
@@ -56,11 +57,12 @@ def _resized(camera: Cameras, bounds: Bounds, view_px: int) -> Cameras:
 
     A camera that is next to the box, or inside it, keeps its image.
     """
-    depth_m = float(project(bounds.center[None], camera)[1])
-    side_m = float(bounds.size_m.max())
+    on_host = camera.on_host
+    depth_m = float(project(bounds.on_host.center[None], on_host)[1])
+    side_m = float(bounds.on_host.size_m.max())
     if depth_m < side_m / 2:
         return camera
-    scale = min(1.0, view_px * depth_m / (side_m * float(camera.K[0, 0, 0])))
+    scale = min(1.0, view_px * depth_m / (side_m * float(on_host.K[0, 0, 0])))
     width, height = camera.max_size_px
     return camera.resized(max(LEAST_SIDE_PX, round(scale * width)), max(LEAST_SIDE_PX, round(scale * height)))
 

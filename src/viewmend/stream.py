@@ -119,7 +119,6 @@ class Stream:
         config: StreamConfig | None = None,
         bounds: Bounds | None = None,
         error_model: Inpainter | None = None,
-        depth_model: Inpainter | None = None,
     ) -> None:
         """Create an empty stream.
 
@@ -127,10 +126,9 @@ class Stream:
             inpainter: completes the views, e.g. `load_inpainter("views")`.
             config: parameters of geometry, rendering and memory.
             bounds: the volume that may contain the subject; None to find it from the masks.
-            error_model: predicts errors in place of `inpainter`, if that does not; needed for the error rule
-                'predicted' and for `RenderQuality.refine_fraction` (`registry.error_model_for`).
-            depth_model: predicts depth in place of `inpainter`, if that does not; needed for the geometry 'fused'
-                (`registry.depth_model_for`).
+            error_model: predicts errors and depth in place of `inpainter`, if that does not; needed for the error rule
+                'predicted', for `RenderQuality.refine_fraction` and for the geometry 'fused'
+                (`registry.error_model_for`).
 
         Raises:
             ValueError: `inpainter` is a name, a class or anything else than an inpainter; or the geometry is 'fused',
@@ -145,11 +143,11 @@ class Stream:
         self.config = config or StreamConfig()
         self.bounds = bounds
         self.error_model = error_model
-        self.depth_model = inpainter if inpainter.predicts_depth else depth_model
-        if self.config.geometry == "fused" and (self.depth_model is None or not self.depth_model.predicts_depth):
+        self._depth_model = inpainter if inpainter.predicts_depth else error_model
+        if self.config.geometry == "fused" and (self._depth_model is None or not self._depth_model.predicts_depth):
             raise ValueError(
                 f"expected a model that predicts depth for the geometry 'fused', got {type(inpainter).__name__} alone; "
-                "give a depth_model: Stream(..., depth_model=load_inpainter('views')), or use the geometry 'hull'"
+                "give one: Stream(..., error_model=load_inpainter('views')), or use the geometry 'hull'"
             )
         self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
         self._warned = False
@@ -163,7 +161,7 @@ class Stream:
     def with_render_config(self, render: RenderConfig) -> "Stream":
         """A stream with the same frames and memory, but another render configuration."""
         config = replace(self.config, render=render)
-        other = Stream(self.inpainter, config, self.bounds, self.error_model, self.depth_model)
+        other = Stream(self.inpainter, config, self.bounds, self.error_model)
         other._frames = self._frames
         return other
 
@@ -212,10 +210,10 @@ class Stream:
         hull = cache_frame(images, self.bounds, self.config.hull, carving)
         if self.config.geometry == "hull":
             return hull
-        assert self.depth_model is not None
+        assert self._depth_model is not None
         start = now_s(images.rgb.device)
         masks = all_masks(images, carving)
-        proxy = fuse_geometry(hull, masks, self.depth_model, self.config.render, self.config.fusion)
+        proxy = fuse_geometry(hull, masks, self._depth_model, self.config.render, self.config.fusion)
         fusion_ms = ms_since(start, images.rgb.device)
         # What was encoded behind the hull does not belong to the new proxy.
         return CachedFrame(images, to_mmap(proxy), hull.geometry_ms + fusion_ms)

@@ -229,3 +229,12 @@ def test_an_orbit_goes_around_the_subject_while_it_is_there(away, tmp_path, mend
     assert code == 2 and "expected a subject to circle, got none" in said
     code, report, said = mend(away, tmp_path / "one", "--leave-out", "held", "--frames", "3:4")
     assert code == 0 and report["psnr_whole"] is None and "1 of 1 frames" in said
+
+
+def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend):
+    reports = {}
+    for geometry in ("hull", "fused"):
+        options = ("--leave-out", "held", "--frames", "0:1", "--geometry", geometry)
+        code, reports[geometry], _ = mend(folder, tmp_path / geometry, *options)
+        assert code == 0
+    assert reports["fused"]["hull_iou"]["held"] != reports["hull"]["hull_iou"]["held"]

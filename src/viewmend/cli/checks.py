@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from viewmend.models.base import Inpainter
     from viewmend.rendering.view import RenderConfig
 
+Geometry = Literal["hull", "fused"]
+"""The kinds of geometry proxy, as in `StreamConfig.geometry`."""
+
 Precision = Literal["auto", "float32", "bfloat16"]
 """Number formats in which our networks compute."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_device, check_least
+from viewmend.cli.checks import Geometry, Precision, PreparationOptions, ViewOptions, check_device, check_least
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -69,6 +69,9 @@ class RunOptions:
     """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    geometry: Geometry = "hull"
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
+    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
     precision: Precision = "auto"
     """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
     same on a machine."""
@@ -166,7 +169,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     available, missing = split_missing(names, options.device)
     networks, missing_networks = available_networks()
     same = {name: getattr(options, name) for name in ("device", "precision", "ssim", "protocol")}
-    stream = StreamConfig(render=options.view.config(), memory_mb=None)
+    stream = StreamConfig(geometry=options.geometry, render=options.view.config(), memory_mb=None)
     settings = RunSettings(stream=stream, background=options.score_background, networks=networks, **same)
     if missing or missing_networks:
         say(f"n/a (the report has the reasons): {', '.join(missing | missing_networks)}")

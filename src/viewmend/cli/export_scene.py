@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from viewmend.cli.checks import Precision, PreparationOptions, check_least
+from viewmend.cli.checks import Geometry, Precision, PreparationOptions, check_least
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ class Options:
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    geometry: Geometry = "hull"
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
+    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
     precision: Precision = "auto"
     """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
     same on a machine."""
@@ -62,13 +65,16 @@ def run(options: Options) -> int:
     from viewmend.data.prepare import first_with_subject, open_masked, prepare
     from viewmend.data.source import prefetch
     from viewmend.export.scene import RESULTS, check_openexr, export_scene
-    from viewmend.stream import Stream
+    from viewmend.models.registry import error_model_for
+    from viewmend.stream import Stream, StreamConfig
     from viewmend.utils.output_folder import OutputFolder
 
     check_openexr()
     opened = open_masked(options.capture, format=options.format)
     times = chosen_times(options.frames, len(opened.frame_ids))
-    stream = Stream(load_named(options.model, options.device, options.precision), bounds=opened.bounds)
+    inpainter = load_named(options.model, options.device, options.precision)
+    depth_model = error_model_for(inpainter, options.device) if options.geometry == "fused" else None
+    stream = Stream(inpainter, StreamConfig(geometry=options.geometry), opened.bounds, depth_model)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
         prepared, size = asdict(options.preparation), options.max_image_size
@@ -83,7 +89,7 @@ def run(options: Options) -> int:
         written = export_scene(frames, stream, views, capture.cameras, folder.draft, **more)
         folder.publish(*RESULTS)
     say(
-        f"{options.out}: {written.frames} frames of {written.views} views; {written.vertices} hull vertices, "
+        f"{options.out}: {written.frames} frames of {written.views} views; {written.vertices} vertices, "
         f"{written.points} points"
     )
     return 0

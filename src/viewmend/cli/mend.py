@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
+from viewmend.cli.checks import Geometry, Precision, PreparationOptions, ViewOptions, check_least
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -70,6 +70,9 @@ class Options:
     It is the hull's depth if the model predicts none."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    geometry: Geometry = "hull"
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
+    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
     precision: Precision = "auto"
     """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
     same on a machine."""
@@ -101,8 +104,10 @@ def run(options: Options) -> int:
     inputs = [name for name in opened.cameras.names if name not in held]
     capture = prepare(opened, inputs, **asdict(options.preparation), first=usable[0], last=usable[-1])
     log_preparation(capture)
-    error_model = error_model_for(inpainter, options.device) if render.error_rule == "predicted" else None
-    config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
+    is_needed = render.error_rule == "predicted" or options.geometry == "fused"
+    error_model = error_model_for(inpainter, options.device) if is_needed else None
+    config = StreamConfig(geometry=options.geometry, render=render, memory_mb=None)
+    quality = RenderQuality(top_k=options.top_k)
     mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol)
     summary = MendSummary(options.protocol)
     mender.background = (turntable and turntable.background) or mender.background

@@ -128,8 +128,9 @@ def evaluate_scene(
 def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     most, last = -1, None
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
+    depth_model = error_model_for(Unfilled(), settings.device) if config.geometry == "fused" else None
     for frame in (to_device(own, settings.device) for own in scene.frames()):
-        stream = Stream(Unfilled(), config, frame.bounds)
+        stream = Stream(Unfilled(), config, frame.bounds, depth_model)
         target_mask, own = revealed(settings.protocol, frame.truth)
         carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)
@@ -179,7 +180,8 @@ class _MethodStream:
         inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
         error_model = error_model_for(inpainter, settings.device) if predicted else None
-        config = replace(settings.stream, background=settings.background)
+        # The geometry comes with the frames, which all methods share.
+        config = replace(settings.stream, geometry="hull", background=settings.background)
         sequence = ViewSequence(inpainter, config, bounds, error_model=error_model)
         sequence.first_twice = new
         return sequence

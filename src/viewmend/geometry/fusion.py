@@ -123,7 +123,7 @@ def _fuse_torch(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) ->
     """The fused occupancy, on any device."""
     occupancy = hull.values.flatten()
     filled = (occupancy > 0).nonzero()[:, 0]
-    centers = hull.cubes.centers[filled]
+    centers = hull.cubes.centers(occupancy.device)[filled]
     parts = [_fuse_points(points, hull.voxel_m, views, config) for points in centers.split(VOXELS_AT_ONCE)]
     out = torch.zeros_like(occupancy)
     if parts:

@@ -90,13 +90,9 @@ def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpa
 
 
 def error_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
-    """The model that predicts errors for `inpainter`: the shipped `views`; None if it predicts them itself."""
-    return None if inpainter.predicts_errors else load_inpainter(ERROR_MODEL, device)
-
-
-def depth_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
-    """The model that predicts depth for the fused geometry: the shipped `views`; None if `inpainter` does it itself."""
-    return None if inpainter.predicts_depth else load_inpainter(ERROR_MODEL, device)
+    """The model that predicts errors and depth for `inpainter`: the shipped `views`; None if it does so itself."""
+    predicts_both = inpainter.predicts_errors and inpainter.predicts_depth
+    return None if predicts_both else load_inpainter(ERROR_MODEL, device)
 
 
 def own_background(name: str) -> str | None:
