@@ -38,7 +38,7 @@ def bowl(points):
 def proxy_of(inside) -> GeometryProxy:
     """The surface of a solid, from a fine grid."""
     cubes = Cubes.of(BOX, 128)
-    values = (0.5 + inside(cubes.centers) / cubes.side_m / 2).clamp(0, 1).view(cubes.shape)
+    values = (0.5 + inside(cubes.centers(torch.device("cpu"))) / cubes.side_m / 2).clamp(0, 1).view(cubes.shape)
     mesh = extract_surface(OccupancyGrid(values, cubes.low, cubes.side_m))
     return GeometryProxy(mesh, vertex_normals(mesh), BOX)
 
