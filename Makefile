@@ -3,26 +3,44 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Without a GPU: the version whose CPU build the package index is known to have.
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
+# Static checks, documents and tests run next to each other.
+MAKEFLAGS += --jobs=4
+PYTEST := $(BIN)/pytest -n auto --dist worksteal
+# Array shapes are checked in every call: by `make test` in these tests, by `make test-all` in all of them.
+CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/test_cameras.py \
+	tests/rendering/test_view.py tests/models/test_attention.py tests/data/test_prepare.py \
+	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
+	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 
-.PHONY: demo test test-all gate format docs clean
+.PHONY: demo test test-all tests shapes kernels gate pyright docs format clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
 
-test: gate docs ## environment, install, the gate, the documents, the tests
-	$(BIN)/pytest -n auto --dist loadfile
+test: gate pyright docs tests shapes ## environment, install, static checks, the documents, the tests
 
-test-all: gate ## the tests that take longer, too
-	$(BIN)/pytest -n auto --dist loadfile -m ""
+test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays in every call
+	$(PYTEST) -m ""
+
+tests: kernels
+	JAXTYPING_DISABLE=1 $(PYTEST)
+
+shapes: kernels
+	$(BIN)/pytest $(CHECKED)
+
+kernels: .venv/installed ## compiled once, not by each worker
+	$(BIN)/python tests/compile_kernels.py
 
 docs: .venv/installed ## the documentation site, in out/site; strict, and nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-gate: .venv/installed ## what CI and you run alike
+gate: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+pyright: .venv/installed
+	$(BIN)/pyright
 
 format: .venv/installed
 	$(BIN)/ruff format .

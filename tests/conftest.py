@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from reference.shared_scenes import make_once, write_balls, write_takes
 
 # Tests are many small computations: a second thread costs more than it brings.
 torch.set_num_threads(1)
@@ -58,3 +59,15 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"the developers' folder {SHARED.name}/ is not next to the repository")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def takes(tmp_path_factory) -> Path:
+    """A folder with the captures of `reference.shared_scenes.write_takes`; leave them as they are."""
+    return make_once(tmp_path_factory, "takes", write_takes)
+
+
+@pytest.fixture(scope="session")
+def balls(tmp_path_factory) -> Path:
+    """A folder with the captures of `reference.shared_scenes.write_balls`; leave them as they are."""
+    return make_once(tmp_path_factory, "balls", write_balls)

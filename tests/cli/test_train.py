@@ -22,14 +22,13 @@ from viewmend.models.views.model import ViewSynthNet
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.recipes import RECIPES
 
-BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")
+BRIEF = ["--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0"]
+BRIEF += ["--sizes-px", "96", "--num-holdout-views", "2"]
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("captures") / "mine"
-    write_capture(Studio(StudioConfig(seed=3, cameras=5, frames=2, size_px=192)), folder)
-    return folder
+@pytest.fixture(scope="session")
+def capture(takes):
+    return takes / "ada"
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +60,7 @@ def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, t
     steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
     assert steps == [1, 2]
     card = (out / "README.md").read_text()
-    assert "100% of the scenes from captures (mine)" in card and f"from `{models / kind}`" in card
+    assert "100% of the scenes from captures (ada)" in card and f"from `{models / kind}`" in card
     assert finetune(capture, models / kind, out) == 0
     assert "nothing to do" in capsys.readouterr().err
     assert finetune(capture, models / kind, out, "--seed", "1") == 2

@@ -1,19 +1,20 @@
 """Fine-tuning holds back a camera and the last frames, and keeps the best weights."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
 import torch
+from reference.ball import BallCapture, ring
 from reference.other_device import other_device
+from reference.shared_scenes import TAKES
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_writer import write_capture
 from viewmend.metrics.lpips import load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.scenes.capture_scenes import make_splits, read_splits, splits_json
-from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training import held_back
 from viewmend.training.config import TrainConfig
 from viewmend.training.held_back import AUTO, HeldBack, HeldBackValidation, compare, held_back_views
@@ -22,34 +23,32 @@ from viewmend.training.scenes import rig_source
 from viewmend.training.views import ViewsObjectiveConfig
 
 
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("captures") / "mine"
-    write_capture(Studio(StudioConfig(seed=5, cameras=5, frames=4, size_px=96)), folder)
-    return folder
+@pytest.fixture(scope="session")
+def place(takes):
+    return takes / "ada"
 
 
 def test_the_middle_camera_and_the_last_tenth_are_held_back():
-    studio = Studio(StudioConfig(seed=5, cameras=5, frames=31, size_px=32))
-    assert HeldBack.of(studio, AUTO) == HeldBack("cam02", 27)
-    assert HeldBack.of(studio, "cam04") == HeldBack("cam04", 27)
-    one_frame = Studio(StudioConfig(seed=5, cameras=5, frames=1, size_px=32))
-    assert HeldBack.of(one_frame, AUTO) == HeldBack("cam02", 1)
-    small = Studio(StudioConfig(seed=5, cameras=4, frames=31, size_px=32))
+    capture = BallCapture(ring(5), frames=31)
+    assert HeldBack.of(capture, AUTO) == HeldBack("c2", 27)
+    assert HeldBack.of(capture, "c4") == HeldBack("c4", 27)
+    one_frame = BallCapture(ring(5), frames=1)
+    assert HeldBack.of(one_frame, AUTO) == HeldBack("c2", 1)
+    small = BallCapture(ring(4), frames=31)
     assert HeldBack.of(small, AUTO) == HeldBack(None, 27)
-    with pytest.raises(CaptureError, match=r"--hold-out among cam00, .*got 'front'"):
-        HeldBack.of(studio, "front")
+    with pytest.raises(CaptureError, match=r"--hold-out among c0, .*got 'front'"):
+        HeldBack.of(capture, "front")
     with pytest.raises(CaptureError, match="at least 5 cameras to hold one back, got 4"):
-        HeldBack.of(small, "cam00")
+        HeldBack.of(small, "c0")
 
 
-def test_training_never_sees_what_is_held_back(place):
-    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out="cam03")
+def test_training_never_sees_what_is_held_back(balls):
+    scenes = replace(SCENES, captures=(balls / "ada",), captures_fraction=1.0, hold_out="c3")
     source = rig_source(scenes, (0, 1), "tests")
     rigs = [source.rig(number).rig for number in range(12)]
     assert {time for rig in rigs for time in rig.frames} == {0, 1, 2}
     names = {name for rig in rigs for frame in rig.frames.values() for name in frame.cameras.names}
-    assert names == {"cam00", "cam01", "cam02", "cam04"}
+    assert names == {"c0", "c1", "c2", "c4"}
 
 
 def test_what_is_held_back_is_scored(place):
@@ -62,14 +61,13 @@ def test_what_is_held_back_is_scored(place):
     assert {view.truth.time for view in table} == {3}
 
 
-def test_of_a_splits_file_the_last_frames_are_held_back(tmp_path):
-    takes = [tmp_path / name for name in ("ada", "bea", "cleo")]
-    for number, take in enumerate(takes):
-        write_capture(Studio(StudioConfig(seed=number, cameras=5, frames=4, size_px=96)), take)
+def test_of_a_splits_file_the_last_frames_are_held_back(balls, tmp_path):
+    captures = [shutil.copytree(balls / name, tmp_path / name) for name in TAKES]
     file = tmp_path / "splits.json"
-    file.write_text(splits_json(make_splits(takes, tmp_path)))
+    file.write_text(splits_json(make_splits(captures, tmp_path)))
     scenes = replace(SCENES, captures=(file,), captures_fraction=1.0, hold_out=AUTO)
-    rigs = [rig_source(scenes, (0, 1), "tests").rig(number) for number in range(12)]
+    source = rig_source(scenes, (0, 1), "tests")
+    rigs = [source.rig(number) for number in range(12)]
     assert {time for own in rigs for time in own.rig.frames} == {0, 1, 2}
     training = {scene.left_out for scene in read_splits(file).scenes if scene.split == "training"}
     assert {own.held_out for own in rigs} == training
@@ -130,7 +128,7 @@ def first_weight(folder):
     return load_network(str(folder)).depth_logits.weight.detach().flatten()[0]
 
 
-def test_psnr_and_lpips_are_both_weighed(place):
-    found = HeldBackValidation([place], AUTO)(ViewSynthNet(VIEWS_MODEL), place.parent / "shown.png")
+def test_psnr_and_lpips_are_both_weighed(place, tmp_path):
+    found = HeldBackValidation([place], AUTO)(ViewSynthNet(VIEWS_MODEL), tmp_path / "shown.png")
     assert found["score"] == pytest.approx(found["psnr_whole"] - held_back.LPIPS_DB * found["lpips_subject"])
-    assert (place.parent / "shown.png").exists()
+    assert (tmp_path / "shown.png").exists()

@@ -50,6 +50,7 @@ def started(out, steps, shards, streams=1, launcher=(), text=SCRIPT):
         return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_from_a_whole_checkpoint(shards, tmp_path):
     run = started(tmp_path / "killed", 1000, shards)
     while len(log_of(tmp_path / "killed")) < 4 or not (tmp_path / "killed" / FILE).exists():
@@ -78,5 +79,6 @@ def test_two_processes_equal_one_with_two_streams(shards, tmp_path):
     assert len(set(curves[0])) == 4
 
 
+@pytest.mark.slow
 def test_no_process_ends_before_the_others(tmp_path):
     assert started(tmp_path / "made", 0, "", launcher=TORCHRUN, text=LAST).wait() == 0

@@ -8,9 +8,9 @@ from random import Random
 
 import pytest
 import torch
+from reference.shared_scenes import TAKES
 from training.conftest import SAMPLING, SCENES, studio_samples
 
-from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.data.source import limit_size
 from viewmend.evaluation.scores import true_view
@@ -266,12 +266,10 @@ def test_hulls_have_the_configured_resolution():
 
 
 @pytest.fixture
-def splits(tmp_path) -> Path:
-    takes = [tmp_path / name for name in ("ada", "bea", "cleo")]
-    for number, take in enumerate(takes):
-        write_capture(Studio(StudioConfig(seed=number, cameras=5, frames=2, size_px=64)), take, images="png")
+def splits(takes, tmp_path) -> Path:
+    captures = [shutil.copytree(takes / name, tmp_path / name) for name in TAKES]
     file = tmp_path / "splits.json"
-    file.write_text(splits_json(make_splits(takes, tmp_path)))
+    file.write_text(splits_json(make_splits(captures, tmp_path)))
     return file
 
 

@@ -10,7 +10,6 @@ import torch
 from reference.other_device import DEVICE, other_device
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
 
-from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import project, unproject
 from viewmend.geometry.rim import rim_depth
 from viewmend.models.checkpoint import load_network, save_inpainter
@@ -65,11 +64,9 @@ def view(stored):
     return TrainingView.of(stored.sample(0, VIEWS_RENDER, 4), ViewSynthNet(VIEWS_MODEL))
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("captures") / "mine"
-    write_capture(Studio(StudioConfig(seed=5, cameras=5, frames=2, size_px=128)), folder)
-    return folder
+@pytest.fixture(scope="session")
+def capture(takes):
+    return takes / "ada"
 
 
 @pytest.fixture(scope="session")
@@ -331,7 +328,7 @@ def test_captures_are_trained_on(capture, tmp_path):
     loss.total.backward()
     assert torch.isfinite(loss.total)
     out = train(config, tmp_path / "run")
-    assert "100% of the scenes from captures (mine)" in (out / "README.md").read_text()
+    assert "100% of the scenes from captures (ada)" in (out / "README.md").read_text()
     stored = OPTIONS.make_scenes(scenes, "0").scene(0)[0]
     again = sample_from_bytes(sample_to_bytes(stored))
     assert again.depth is None and again.sample(0, VIEWS_RENDER, 4).depth is None

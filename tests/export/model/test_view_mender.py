@@ -86,6 +86,7 @@ def test_a_view_that_names_one_camera_is_refused(net):
         ViewInputs.of(alone, context, 4)
 
 
+@pytest.mark.slow
 def test_the_model_is_traced_for_all_sizes(net, tmp_path):
     """In a process of its own: the type checks of tests are not to be traced."""
     save_inpainter(net, tmp_path / "tiny", "# card")
