@@ -6,10 +6,16 @@ from pathlib import Path
 
 import torch
 
-from viewmend import Stream, load_inpainter, open_capture, prepare
-from viewmend.data.images import write_image
-from viewmend.data.native_writer import write_capture
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend import (
+    Stream,
+    Studio,
+    StudioConfig,
+    load_inpainter,
+    open_capture,
+    prepare,
+    write_capture,
+    write_image,
+)
 
 
 def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:

@@ -11,7 +11,9 @@ from viewmend.utils.openmp import let_idle_threads_sleep
 
 if TYPE_CHECKING:
     from viewmend.data.errors import CaptureError
+    from viewmend.data.images import write_image
     from viewmend.data.native_capture import open_capture
+    from viewmend.data.native_writer import write_capture
     from viewmend.data.prepare import prepare
     from viewmend.frame_cache import CachedFrame, DepthProvider
     from viewmend.geometry.bounds import Bounds
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from viewmend.rendering.error_mask import Evidence, error_rule
     from viewmend.rendering.view import RenderConfig
     from viewmend.stream import Stream, StreamConfig, StreamView
+    from viewmend.studio.rigs import orbit
+    from viewmend.studio.stage import Studio, StudioConfig
     from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
     from viewmend.utils.timing import StageTimes
 
@@ -59,6 +63,8 @@ __all__ = [
     "Stream",
     "StreamConfig",
     "StreamView",
+    "Studio",
+    "StudioConfig",
     "Viewer",
     "__version__",
     "error_rule",
@@ -66,14 +72,19 @@ __all__ = [
     "look_at",
     "make_method",
     "open_capture",
+    "orbit",
     "pinhole",
     "prepare",
     "serve",
+    "write_capture",
+    "write_image",
 ]
 
 _NAMES = {
     "data.errors": ("CaptureError",),
+    "data.images": ("write_image",),
     "data.native_capture": ("open_capture",),
+    "data.native_writer": ("write_capture",),
     "data.prepare": ("prepare",),
     "frame_cache": ("CachedFrame", "DepthProvider"),
     "geometry.bounds": ("Bounds",),
@@ -89,6 +100,8 @@ _NAMES = {
     "rendering.error_mask": ("Evidence", "error_rule"),
     "rendering.view": ("RenderConfig",),
     "stream": ("Stream", "StreamConfig", "StreamView"),
+    "studio.rigs": ("orbit",),
+    "studio.stage": ("Studio", "StudioConfig"),
     "types": ("CompletedView", "ContextViews", "IncompleteView", "MultiViewFrame", "Silhouettes"),
     "utils.timing": ("StageTimes",),
 }

@@ -281,7 +281,19 @@ def _is_complete(data: bytes) -> bool:
 def write_image(path: Path, image: UInt8[np.ndarray, "height width *channel"]) -> None:
     """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
 
-    ValueError if that is no image format, OSError if the file cannot be written.
+    Raises:
+        ValueError: the suffix is that of no image format.
+        OSError: the file cannot be written.
+
+    Examples:
+        >>> import numpy as np
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from viewmend import write_image
+        >>> with TemporaryDirectory() as folder:
+        ...     write_image(Path(folder) / "black.png", np.zeros((4, 6, 3), np.uint8))
+        ...     (Path(folder) / "black.png").is_file()
+        True
     """
     # No chroma subsampling (4:4:4), which would blur coloured edges.
     jpeg = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)

@@ -40,8 +40,26 @@ def write_capture(
 
     With PNG, reading the folder returns the same frames bit for bit (depth to half a millimetre). JPEG (quality 95,
     no chroma subsampling) is smaller; masks and depth are always PNG. The folder is complete or absent, see
-    `atomic_folder`. `progress` wraps the iterated frame indices. Returns the indices of frames with masks but without a
-    subject. CaptureError if `out` exists and is not empty, or the source cannot be read.
+    `atomic_folder`. Returns the indices of frames with masks but without a subject.
+
+    Args:
+        source: a capture, a studio, or any other object with their attributes and `read`.
+        out: a new or empty folder.
+        images: the format of the camera images.
+        progress: wraps the frame indices while they are iterated over, as a progress bar does.
+
+    Raises:
+        CaptureError: `out` exists and is not empty, or the source cannot be read.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from viewmend import Studio, StudioConfig, open_capture, write_capture
+        >>> with TemporaryDirectory() as folder:
+        ...     write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), Path(folder) / "take")
+        ...     open_capture(Path(folder) / "take").cameras.names
+        ()
+        ('cam00', 'cam01', 'cam02', 'cam03')
     """
     with atomic_folder(out) as unfinished:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")

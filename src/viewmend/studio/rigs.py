@@ -59,6 +59,11 @@ def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_
     """Novel cameras on a circle around the middle of who stands on the stage.
 
     Azimuth 0 is in front (+z), and azimuths grow towards +x.
+
+    Examples:
+        >>> from viewmend import orbit
+        >>> orbit([0.0, 0.5], (320, 240)).names
+        ('orbit000', 'orbit001')
     """
     center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
     shown = {"radius_m": RADIUS_M, "elevation_rad": elevation_rad, "visible_m": VISIBLE_M}

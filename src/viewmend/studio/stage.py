@@ -27,7 +27,13 @@ BOUNDS_MARGIN_M = 0.08
 
 @dataclass(frozen=True, kw_only=True)
 class StudioConfig:
-    """One capture of the studio; all randomness follows from `seed`."""
+    """One capture of the studio; all randomness follows from `seed`.
+
+    Examples:
+        >>> from viewmend import StudioConfig
+        >>> StudioConfig(cameras=8, frames=10, size_px=(640, 480)).fps
+        30.0
+    """
 
     seed: int = 0
     """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are
@@ -58,7 +64,14 @@ class StudioConfig:
 
 
 class Studio:
-    """A capture stage in software: a `CaptureSource` that also renders ground truth for any view."""
+    """A capture stage in software: a `CaptureSource` that also renders ground truth for any view.
+
+    Examples:
+        >>> from viewmend import Studio, StudioConfig
+        >>> studio = Studio(StudioConfig(cameras=4, frames=2, size_px=64))
+        >>> studio.read(1).rgb.shape
+        torch.Size([4, 3, 64, 64])
+    """
 
     def __init__(self, config: StudioConfig | None = None, performer: Performer | None = None) -> None:
         """Set up the stage.

@@ -1,6 +1,6 @@
 """A method of your own in one file: a subclass of `Inpainter` with a `step`.
 
-    viewmend evaluate P --methods telea,examples/new_method.py:Afterimage --out out/mine
+    viewmend evaluate P --methods telea,examples/03_own_method.py:Afterimage --out out/mine
 
 `Afterimage` fills a hole with the colours of the same pixels in previous views, darkened, and otherwise with the mean
 colour of the view. It uses no camera; a method that does calls `context(time, view.source_views)`, which returns
@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from viewmend.models.base import ContextProvider, Inpainter, State
-from viewmend.types import CompletedView, IncompleteView
+from viewmend import CompletedView, ContextProvider, IncompleteView, Inpainter, State
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,8 @@ class Afterimage(Inpainter):
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, Memory]:
         whole = (view.mask > 0) & (view.error == 0)
         mean = view.rgb[:, whole].mean(1) if bool(whole.any()) else view.rgb.new_zeros(3)
-        fill, seen = mean[:, None, None].expand_as(view.rgb), torch.zeros_like(whole)
+        fill = mean[:, None, None].expand_as(view.rgb)
+        seen = torch.zeros_like(whole)
         if isinstance(state, Memory) and state.rgb is not None and state.rgb.shape == view.rgb.shape:
             seen = state.seen
             fill = torch.where(seen, self.fading * state.rgb, fill)

@@ -1,10 +1,8 @@
-"""An error rule of your own: `python examples/new_error_rule.py` prints how much of a view each rule selects."""
+"""An error rule of your own: `python examples/04_own_error_rule.py` prints how much of a view each rule selects."""
 
 import torch
 
-from viewmend import Evidence, RenderConfig, Stream, StreamConfig, error_rule, make_method
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend import Evidence, RenderConfig, Stream, StreamConfig, Studio, StudioConfig, error_rule, make_method, orbit
 
 THRESHOLD = 0.05
 """Spread of the source cameras' colours, in [0, 1], above which a pixel counts as wrong."""
