@@ -2,10 +2,12 @@
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from reference.ball import BallCapture, ring
 from reference.films import picture, write_film
@@ -14,9 +16,13 @@ from reference.foreign_images import write_agisoft
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
+from viewmend.data.checks.leave_one_out import find_outlier_by_hull
 from viewmend.data.errors import CaptureError
+from viewmend.data.formats import read_any_calibration
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
+from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.proxy import reconstruct
 
 EASYMOCAP, QUALISYS, POSE2SIM, OPENCV = "easymocap", "qualisys", "pose2sim", "opencv"
 
@@ -190,3 +196,49 @@ def test_a_mask_that_is_turned_without_exif_is_named(lying):
         Image.open(path).transpose(Image.Transpose.ROTATE_90).save(path)
     with pytest.raises(CaptureError, match="mask is turned by 90 degrees and the image is not"):
         open_capture(lying).read(0)
+
+
+def test_cameras_that_see_all_of_the_subject_are_not_blamed_for_borders(tmp_path):
+    cameras = ring(8)
+    frame = BallCapture(cameras).read(0)
+    assert frame.mask is not None
+    for narrow in (4, 7):
+        parts = [cameras[view].cropped(0, 0, 48, 26 if view < narrow else 48) for view in range(8)]
+        mask = frame.mask.clone()
+        mask[:narrow, 26:] = 0
+        cut = replace(frame, cameras=concatenate_cameras(parts), mask=mask)
+        assert [issue for issue in find_outlier_by_hull(cut, None) if issue.camera] == []
+        hull = reconstruct(mask, cut.cameras)
+        assert narrow == 7 or float(hull.bounds.size_m[1]) > 0.9
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (412345.6, 4512345.6, 210.0)])
+def test_a_capture_far_from_the_origin_is_computed_near_it(plain, offset):
+    before = open_capture(plain.path)
+    near = read_any_calibration(plain.path)
+
+    def move(content):
+        for camera in content["cameras"]:
+            camera["t"] = (np.array(camera["t"]) - np.array(camera["R"]) @ np.array(offset)).tolist()
+        if content.get("bounds"):
+            content["bounds"] = (np.array(content["bounds"]) + offset).tolist()
+
+    plain.edit(move)
+    moved = open_capture(plain.path)
+    distances = [torch.cdist(c.cameras.centers, c.cameras.centers) for c in (before, moved)]
+    torch.testing.assert_close(*distances, atol=1e-5, rtol=1e-5)
+    assert float(moved.cameras.centers.abs().max()) < 1000
+    write_capture(moved, plain.path.parent / "written", images="png")
+    again = read_any_calibration(plain.path.parent / "written")
+    for one, other in zip(near.cameras, again.cameras, strict=True):
+        center = -other.R.T @ other.t_m + again.origin_m
+        np.testing.assert_allclose(center, -one.R.T @ one.t_m + near.origin_m + np.array(offset), atol=1e-4)
+
+
+def test_cameras_too_far_for_32_bits_are_refused():
+    cameras = ring(4)
+    pose = cameras.camera_from_world.double()
+    pose[:, :3, 3] -= pose[:, :3, :3] @ torch.tensor([4e5, 4.5e6, 200.0], dtype=torch.float64)
+    far = replace(cameras, camera_from_world=pose.float())
+    with pytest.raises(ValueError, match=r"near the world's origin, got a rig of .* subtract the rig's centre"):
+        far.check()

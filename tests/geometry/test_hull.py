@@ -55,7 +55,8 @@ def test_equals_the_twin(path, pixels_per_voxel):
     grid = visual_hull(masks, cameras, bounds, config)
     pool = max(1, int(hull_module._footprint_px(cameras, bounds, grid.voxel_m) / pixels_per_voxel))
     assert (pool > 1) == (pixels_per_voxel == 1.0)
-    twin = hull_twin(masks, cameras, grid.low, grid.voxel_m, grid.values.shape, pool, 3)
+    needed = hull_module.needed_views(5, config, hull_module.count_cut_off(masks, cameras))
+    twin = hull_twin(masks, cameras, grid.low, grid.voxel_m, grid.values.shape, pool, needed)
     # A voxel whose image is on an image's very border may be seen by one and not by the other.
     assert ((grid.values - torch.from_numpy(twin)).abs() > 0.01).float().mean() < 1e-3
     assert 0.05 < (grid.values > 0.5).float().mean() < 0.95

@@ -112,6 +112,7 @@ def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dic
         "last_frame": capture.frame_ids[-1],
         "fps": capture.fps,
         "metres_per_unit": capture.metres_per_unit,
+        "origin_m": capture.origin_m.tolist(),
         "up": None if capture.up is None else capture.up.tolist(),
         "bounds_m": None if bounds is None else [bounds.low.tolist(), bounds.high.tolist()],
         "rig_extent_m": (cameras.centers.amax(0) - cameras.centers.amin(0)).tolist(),
@@ -162,6 +163,11 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         f"  depth     {'yes' if capture['depth'] else 'none'}",
         f"  gaps      {f'{len(gaps)}: ' if gaps else 'none'}{', '.join(gaps[:3])}{', ...' if len(gaps) > 3 else ''}",
         f"  unit      {capture['metres_per_unit']:g} m; all lengths below are in metres",
+        *(
+            [f"  origin    {_vector(capture['origin_m'])} m in the capture's files; its coordinates below are relative"]
+            if any(capture["origin_m"])
+            else []
+        ),
         f"  up        {'unknown' if capture['up'] is None else _vector(capture['up'], 3)}",
         f"  bounds    {'none' if bounds is None else f'{_vector(bounds[0])} to {_vector(bounds[1])}'}",
         f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",

@@ -181,12 +181,13 @@ def _plan(
 ) -> "list[tuple[int, Cameras]]":
     """Frame indices and the camera of each view, in order."""
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
+    from viewmend.data.native_capture import origin_of
 
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in times]
     if turntable is not None:
         return _circle(turntable, capture, usable)
-    return pair_with_frames(read_camera_path(Path(str(options.path)), capture.cameras), times)
+    return pair_with_frames(read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture)), times)
 
 
 def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int]) -> "list[tuple[int, Cameras]]":

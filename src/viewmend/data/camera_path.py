@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 from msgspec import Meta, Struct
 
 from viewmend.geometry.cameras import Cameras, is_intrinsics
@@ -38,12 +40,13 @@ class PathFile(Struct, frozen=True):
             raise ValueError("expected both 'width' and 'height', got one of them; write both or neither")
 
 
-def read_camera_path(file: Path, like: Cameras) -> Cameras:
+def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3"] | None = None) -> Cameras:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object with that list as
-    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height". ValueError
-    if it has other content.
+    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height". `origin_m`
+    is where the origin of `like` lies in the capture's own world (`origin_of`); poses that are nearer to it than to 0
+    are in that world. ValueError if the file has other content.
     """
     try:
         content = read_json(bounded_bytes(file))
@@ -52,7 +55,15 @@ def read_camera_path(file: Path, like: Cameras) -> Cameras:
         raise ValueError(f"{file}: {error}") from None
     except OSError as error:
         raise ValueError(f"{file}: expected a file with camera poses, got: {error.strerror}; check --path") from error
-    poses, first, count = torch.tensor(path.world_from_camera), like[0], len(path.world_from_camera)
+    poses = torch.tensor(path.world_from_camera, dtype=torch.float64)
+    positions = poses[:, :3, 3]
+    if origin_m is not None:
+        moved = positions - torch.from_numpy(origin_m)
+        if float(moved.norm(dim=-1).mean()) < float(positions.norm(dim=-1).mean()):
+            poses[:, :3, 3] = moved
+    poses = poses.float()
+    first = like[0]
+    count = len(poses)
     K = first.K.cpu() if path.K is None else torch.tensor([path.K])
     size = first.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
     names = tuple(f"view{n:03d}" for n in range(count))

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue
@@ -38,6 +38,7 @@ from viewmend.data.native_format import (
     NativeCamera,
     stays_inside,
 )
+from viewmend.data.source import CaptureSource, CaptureWrapper
 from viewmend.data.video_clock import ABSENT, Track, TrackKind, VideoClock, match_tracks, video_track
 from viewmend.data.videos import VideoFile, is_video, video_properties
 from viewmend.geometry.bounds import Bounds
@@ -88,6 +89,13 @@ def open_capture(
     return capture
 
 
+def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
+    """The coordinates, in a capture's own files, of the origin that its cameras and bounds refer to; metres."""
+    while isinstance(source, CaptureWrapper):
+        source = source.source
+    return source.origin_m if isinstance(source, NativeCapture) else np.zeros(3)
+
+
 class NativeCapture:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
@@ -119,6 +127,8 @@ class NativeCapture:
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
         corners = calibration.bounds_m
         self.bounds = None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+        self.origin_m = calibration.origin_m
+        """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far from the folder's."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")

@@ -4,7 +4,7 @@ import difflib
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal
 
@@ -21,6 +21,8 @@ from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_j
 FORMAT = "plain-capture/1"
 CALIBRATION = "cameras.json"
 ROTATION_TOLERANCE = 1e-3
+FAR = 100.0
+"""Distance of a rig from its origin, relative to its extent, above which the origin is moved to the rig."""
 FileKind = Literal["image", "video", "mask", "depth"]
 FILE_KINDS: tuple[FileKind, ...] = ("image", "video", "mask", "depth")
 Text = Annotated[str, Meta(min_length=1)]
@@ -140,6 +142,9 @@ class NativeCalibration:
     """The file that it was read from."""
     folder: Path
     """The folder that the cameras' paths are relative to."""
+    origin_m: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """The file's coordinates of this calibration's origin, which is near the cameras: 0 unless these are far from the
+    file's origin, as in survey coordinates."""
 
 
 def read_calibration(folder: Path) -> NativeCalibration:
@@ -169,7 +174,7 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
     file = typed({"format": FORMAT, **read_json(json.dumps(content))}, _File)
     shift_px = 0.5 - np.array(file.first_pixel_center)
     up = None if file.up is None else np.array(file.up)
-    return NativeCalibration(
+    calibration = NativeCalibration(
         frames=file.frames,
         cameras=tuple(_camera(entry, shift_px, file.metres_per_unit) for entry in file.cameras),
         up=None if up is None else up / np.linalg.norm(up),
@@ -179,25 +184,52 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
         file=path,
         folder=path.parent,
     )
+    return moved_to(calibration, _near_origin_m(calibration))
+
+
+def _near_origin_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
+    """An origin near the cameras with round coordinates; 0 if the present one is near enough for 32-bit numbers."""
+    centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
+    middle_m = centers_m.mean(0)
+    extent_m = float((centers_m.max(0) - centers_m.min(0)).max())
+    if not np.isfinite(middle_m).all() or np.abs(middle_m).max() <= FAR * extent_m or extent_m == 0:
+        return np.zeros(3)
+    step_m = 10.0 ** np.ceil(np.log10(extent_m))
+    return np.rint(middle_m / step_m) * step_m
+
+
+def moved_to(calibration: NativeCalibration, origin_m: Float64[np.ndarray, "3"]) -> NativeCalibration:
+    """The same calibration with its origin at these coordinates of its file, computed in 64 bits."""
+    step_m = origin_m - calibration.origin_m
+    if not step_m.any():
+        return calibration
+    cameras = tuple(replace(camera, t_m=camera.t_m + camera.R @ step_m) for camera in calibration.cameras)
+    bounds_m = None if calibration.bounds_m is None else calibration.bounds_m - step_m
+    return replace(calibration, cameras=cameras, bounds_m=bounds_m, origin_m=origin_m)
 
 
 def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
     K = np.array(entry.K)
     K[:2, 2] += shift_px
     u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
+    centre = -np.linalg.solve(np.array(entry.R), np.array(entry.t))  # which the change of R would move
     return NativeCamera(
         **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms")},
         **{kind: path and path.replace("\\", "/") for kind in FILE_KINDS for path in [getattr(entry, kind)]},
         K=K,
         R=u @ vt,
-        t_m=np.array(entry.t) * scale,
+        t_m=-(u @ vt) @ centre * scale,
         dist=np.array(entry.dist),
         colour=None if entry.colour is None else np.array(entry.colour),
     )
 
 
 def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
-    """Write a `cameras.json` that reads back as this calibration. File paths are kept as they are."""
+    """Write a `cameras.json` that reads back as this calibration, in the coordinates of the file that it came from.
+
+    File paths are kept as they are.
+    """
+    calibration = moved_to(calibration, np.zeros(3))
     content = {
         "format": FORMAT,
         "first_pixel_center": [0.5, 0.5],

@@ -15,6 +15,7 @@ import torch
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_depth, write_image
+from viewmend.data.native_capture import origin_of
 from viewmend.data.native_format import (
     CALIBRATION,
     FILE_KINDS,
@@ -158,6 +159,7 @@ class _Writer:
             metres_per_unit=1.0,
             file=self.folder / CALIBRATION,
             folder=self.folder,
+            origin_m=origin_of(source),
         )
 
 

@@ -1,5 +1,6 @@
 """One clock for all films of a capture: which frame of each film shows what the others show at the same time."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ RATE_TOLERANCE = 0.02
 NOTEWORTHY = 0.05
 """Films that differ in length by a smaller share are not mentioned."""
 MAX_NAMED = 3
+DAY_S = 86400.0
+"""Timecodes start again at midnight, seconds."""
 
 TrackKind = Literal["images", "masks"]
 
@@ -40,6 +43,10 @@ class Track:
     """Frames per second, gaps aside; None for a single frame."""
     offset_s: float = 0.0
     """How far the camera's clock is ahead of the others'."""
+    is_timed: bool = True
+    """Whether the film stores its times; if not, they follow from an assumed rate."""
+    timecode_s: float | None = None
+    """The recorder's clock at the film's time 0; None if the film has no timecode."""
 
     @property
     def gaps(self) -> list[tuple[float, int]]:
@@ -59,7 +66,22 @@ def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0)
         video = video_properties(path)
     except CaptureError as error:
         raise CaptureError(f"{path}: camera '{camera}': {str(error).removeprefix(f'{path}: ')}") from None
-    return Track(camera, kind, np.array(video.times_s), video.fps, offset_s)
+    clock_s = None if video.timecode is None or video.fps is None else timecode_s(video.timecode, video.fps)
+    return Track(camera, kind, np.array(video.times_s), video.fps, offset_s, video.is_timed, clock_s)
+
+
+def timecode_s(text: str, fps: float) -> float | None:
+    """The seconds since midnight of a timecode, HH:MM:SS:FF, or with a semicolon in drop-frame counting; else None."""
+    parts = re.fullmatch(r"(\d+):(\d+):(\d+)([:;.,])(\d+)", text.strip())
+    if parts is None:
+        return None
+    hours, minutes, seconds, frames = (int(parts[group]) for group in (1, 2, 3, 5))
+    nominal = round(fps)
+    minutes += 60 * hours
+    count = (60 * minutes + seconds) * nominal + frames
+    if parts[4] != ":":  # two numbers of each minute are skipped, except in every tenth minute
+        count -= 2 * round(nominal / 30) * (minutes - minutes // 10)
+    return count / fps
 
 
 @dataclass(frozen=True)
@@ -80,6 +102,8 @@ class VideoClock:
     """Films that had no time in common with the others, and were moved to start together with them."""
     by_index: frozenset[str]
     """Cameras whose masks have other times, but as many frames as their images, and were matched one to one."""
+    timecodes: str | None = None
+    """What the films' timecodes say of their starts, if these differ, and whether they were used."""
 
     @property
     def fps(self) -> float | None:
@@ -114,7 +138,8 @@ class VideoClock:
             if track.camera in cameras:
                 for fault in self._faults(track):
                     faults.setdefault(fault, []).append(track.camera)
-        return tuple(Issue(fault.format(_named(names))) for fault, names in faults.items())
+        found = tuple(Issue(fault.format(_named(names))) for fault, names in faults.items())
+        return found if self.timecodes is None else (Issue(self.timecodes), *found)
 
     def _faults(self, track: Track) -> list[str]:
         """The faults of a film, with {} for the camera."""
@@ -126,6 +151,8 @@ class VideoClock:
                 return [f"{what} have other times than the images, but as many frames; they are matched one to one"]
             if np.array_equal(track.times_s, images[0].times_s):
                 return []
+        if track.kind == "images" and not track.is_timed:
+            faults.append(f"{what} have no times in their files; they are matched by index at {own_fps(track):.4g} fps")
         if (track.camera, track.kind) in self.moved:
             faults.append(f"{what} have no time in common with {than}; they are taken to start together")
         own_rate, fastest = track.fps or rate, rate * (1 + RATE_TOLERANCE)
@@ -150,6 +177,11 @@ class VideoClock:
         return faults
 
 
+def own_fps(track: Track) -> float:
+    """Frames per second by the times of a track; 1 for a single frame."""
+    return track.fps or 1.0
+
+
 def _extent(tracks: Sequence[Track]) -> tuple[float, float]:
     """When the first of some films starts, and the last one ends."""
     ends = [float(track.times_s[-1]) + (1 / track.fps if track.fps else 0.0) for track in tracks]
@@ -168,7 +200,8 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     Other films fill its gaps. Films of its rate that run with a constant distance of less than a frame are matched one
     to one, and so are masks with as many frames as their images. ValueError if no two cameras share a time.
     """
-    tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in tracks]
+    tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
+    tracks, timecodes = _by_timecode(tracks)
     images = {track.camera: track for track in tracks if track.kind == "images"}
     order = sorted(images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
     rate = round(order[len(order) // 2].fps or 0.0, 1)
@@ -205,7 +238,53 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     times, frames = times[kept], {key: index[kept] for key, index in found.items()}
     ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
     end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
-    return VideoClock(tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index))
+    return VideoClock(
+        tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index), timecodes
+    )
+
+
+def _with_known_rates(tracks: Sequence[Track]) -> list[Track]:
+    """The tracks, of which those without times have the usual rate of the images that have times, if there are any."""
+    rates = [track.fps for track in tracks if track.is_timed and track.kind == "images" and track.fps]
+    if not rates:
+        return list(tracks)
+    usual = float(np.median(rates))
+    return [
+        track if track.is_timed else replace(track, fps=usual, times_s=np.arange(len(track.times_s)) / usual)
+        for track in tracks
+    ]
+
+
+def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
+    """The tracks at the times of their recorders' clocks, and what was found; unchanged if these do not fit together.
+
+    All films of images need a timecode, and there has to be a time at which all of them run.
+    """
+    films = [track for track in tracks if track.kind == "images"]
+    starts = {track.camera: track.timecode_s for track in films if track.timecode_s is not None}
+    if len(starts) < 2:
+        return tracks, None
+    latest = max(starts.values())
+    starts = {name: start + DAY_S if latest - start > DAY_S / 2 else start for name, start in starts.items()}
+    first, last = min(starts, key=starts.__getitem__), max(starts, key=starts.__getitem__)
+    apart_s = starts[last] - starts[first]
+    if apart_s * max(track.fps or 1.0 for track in films) < TOLERANCE:
+        return tracks, None
+    differ = f"the films' timecodes start up to {apart_s:.2f} s apart (first '{first}', last '{last}')"
+    without = [track.camera for track in films if track.camera not in starts]
+    if without:
+        return tracks, f"{differ}, but {_named(without)} has none; films are taken to start together, see offset_ms"
+    shift = {name: start - starts[first] for name, start in starts.items()}
+    ends = [float(track.times_s[-1]) + shift[track.camera] for track in films]
+    if min(ends) < max(float(track.times_s[0]) + shift[track.camera] for track in films):
+        return tracks, f"{differ}, and there is no time at which all run; films are taken to start together"
+    moved = []
+    for track in tracks:
+        own = track.timecode_s
+        from_s = shift[track.camera] if track.kind == "images" or own is None else own - starts[first]
+        moved.append(replace(track, times_s=track.times_s + from_s))
+    remove = "ffmpeg -i IN -map 0:v -c copy -write_tmcd 0 OUT"
+    return moved, f"{differ}; they are matched by timecode; if they were cut to start together, remove it ({remove})"
 
 
 def _nearest(times: Float64[np.ndarray, "time"], wanted: Float64[np.ndarray, "frame"]) -> Int[np.ndarray, "frame"]:

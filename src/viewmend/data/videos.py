@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from viewmend.data.errors import CaptureError
+from viewmend.data.film_colours import is_srgb, to_srgb
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -37,6 +38,8 @@ ABSOLUTE_TIMES = {"mp4", "matroska"}
 """Containers in which time 0 is the start of the recording; in the others the first frame is."""
 MAX_ENCODER_DELAY = 2.5
 """A fragmented MP4 with B-frames starts up to this many frames late, which is not a part of the recording."""
+WITHOUT_TIMES = {"h264", "hevc", "mjpeg", "mpegvideo", "obu", "m4v", "dirac", "vc1"}
+"""Raw streams, whose frames have no times and whose rate is often assumed."""
 HIDDEN_FRAMES = ("vp8",)
 """Codecs of which some packets show no frame, so that packets cannot be counted instead of frames."""
 CHECKED_FRAMES = 8
@@ -75,6 +78,12 @@ class VideoProperties:
     """The decoder's own times of the frames; None if they do not increase, so that frames are counted instead."""
     keys: tuple[int, ...]
     """The timestamps at which decoding can start."""
+    is_timed: bool = True
+    """Whether the file stores the times of its frames; raw streams do not."""
+    is_interlaced: bool = False
+    """Whether frames are made of two fields. They are read de-interlaced, at the time of their first field."""
+    timecode: str | None = None
+    """The recorder's clock at the first frame, HH:MM:SS:FF, or HH:MM:SS;FF in drop-frame counting."""
 
     @property
     def frames(self) -> int:
@@ -98,6 +107,8 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
         packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
         reordered, names = codec.has_b_frames, set(container.format.name.split(","))
+        notes = [container.metadata, *(other.metadata for other in (stream, *container.streams))]
+        timecode = next((found["timecode"] for found in notes if "timecode" in found), None)
     head = list(islice(_decoded(path), CHECKED_FRAMES))
     if not head:
         raise CaptureError(f"{path}: expected a video, got a file without decodable frames; export it again")
@@ -117,7 +128,18 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         seconds -= seconds[0]
     height, width = _upright(np.empty((head[0].height, head[0].width), np.uint8), head[0]).shape
     keys = tuple(sorted(time for time, key in packets if key and time is not None)) if timestamps else ()
-    return VideoProperties(path, width, height, fps, tuple(seconds.tolist()), timestamps, keys)
+    return VideoProperties(
+        path,
+        width,
+        height,
+        fps,
+        tuple(seconds.tolist()),
+        timestamps,
+        keys,
+        is_timed=not names & WITHOUT_TIMES,
+        is_interlaced=2 * sum(frame.interlaced_frame for frame in head) > len(head),
+        timecode=timecode,
+    )
 
 
 def _timestamps(path: Path, packets: list[tuple[int | None, bool]], head: list[int | None]) -> tuple[int, ...] | None:
@@ -189,13 +211,13 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
     if start >= video.frames:
         return
     if times is None:
-        yield from islice(enumerate(_decoded(video.path, None, threads)), start, None)
+        yield from islice(enumerate(_progressive(video, None, threads)), start, None)
         return
     key = bisect_right(video.keys, times[start]) - 1
-    frames = _decoded(video.path, video.keys[key] if key > 0 else None, threads)
+    frames = _progressive(video, video.keys[key] if key > 0 else None, threads)
     first = next(frames, None)
     if key > 0 and (first is None or first.pts is None or first.pts > video.keys[key]):  # the seek has missed
-        frames = _decoded(video.path, None, threads)
+        frames = _progressive(video, None, threads)
         first = next(frames, None)
     for frame in chain([] if first is None else [first], frames):
         index = bisect_left(times, frame.pts) if frame.pts is not None else len(times)
@@ -203,12 +225,49 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
             yield index, frame
 
 
+def _progressive(video: VideoProperties, seek: int | None, threads: int) -> "Iterator[VideoFrame]":
+    """The decoded frames, de-interlaced if the film is interlaced."""
+    frames = _decoded(video.path, seek, threads)
+    return _deinterlaced(frames) if video.is_interlaced else frames
+
+
+def _deinterlaced(frames: "Iterator[VideoFrame]") -> "Iterator[VideoFrame]":
+    """Each frame's first field, with the other field's rows interpolated by FFmpeg's bwdif."""
+    from av import BlockingIOError, FFmpegError
+    from av.filter import Graph
+
+    first = next(frames, None)
+    if first is None:
+        return
+    graph = Graph()
+    base = first.time_base or Fraction(1, 25)
+    source = graph.add_buffer(width=first.width, height=first.height, format=first.format, time_base=base)
+    graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:parity=auto:deint=all"), graph.add("buffersink"))
+    graph.configure()
+    for frame in chain([first], frames, [None]):
+        graph.push(frame)
+        while True:
+            try:
+                made: Any = graph.pull()
+            except (BlockingIOError, FFmpegError):
+                break
+            if made.pts is not None and made.time_base:
+                made.pts = round(made.pts * made.time_base / base)
+                made.time_base = base
+            yield made
+
+
 def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image:
-    """A decoded frame as upright RGB, by the matrix and range that it declares, at its own or another upright size."""
+    """A decoded frame as upright sRGB, by the colours that it declares, at its own or another upright size."""
     stored_px = frame.width, frame.height
     width, height = stored_px if size_px is None else size_px[::-1] if is_turned(frame) else size_px
     how = NO_CHROMA_FILTER if (width, height) == stored_px else "AREA"
-    rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=how)
+    primaries, transfer = int(frame.color_primaries), int(frame.color_trc)
+    if is_srgb(primaries, transfer):
+        rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=how)
+    else:
+        deep = frame.to_ndarray(format="rgb48le", width=width, height=height, interpolation=how)
+        rgb = to_srgb(deep, primaries, transfer)
     return np.ascontiguousarray(_upright(rgb, frame))
 
 

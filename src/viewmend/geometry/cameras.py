@@ -12,6 +12,10 @@ from torch import Tensor
 from viewmend.geometry.rigid import invert_rigid
 from viewmend.utils.tensors import OnDevice, check_tensor
 
+FARTHEST = 2e4
+"""Largest distance of cameras from the origin, relative to the extent of their rig; at that distance, 32-bit positions
+are exact to a thousandth of the extent."""
+
 
 @dataclass(frozen=True)
 class Cameras(OnDevice):
@@ -89,6 +93,19 @@ class Cameras(OnDevice):
             convert="convert it with .long()",
             arrange="give width and height of each camera",
         )
+
+        self._check_distance()
+
+    def _check_distance(self) -> None:
+        """ValueError if the cameras are so far from the world's origin that 32-bit poses are too coarse."""
+        centers = self.centers.detach()
+        extent_m = float((centers.amax(0) - centers.amin(0)).amax())
+        away_m = float(centers.abs().amax())
+        if extent_m > 0 and away_m > FARTHEST * extent_m:
+            raise ValueError(
+                f"expected cameras near the world's origin, got a rig of {extent_m:.3g} m that is {away_m:.3g} m away "
+                "from it, where 32-bit numbers are too coarse; subtract the rig's centre from all positions, in 64 bits"
+            )
 
     def check_single(self) -> None:
         """ValueError unless this is one camera that passes `check`."""

@@ -18,6 +18,9 @@ from viewmend.geometry.threads import parallel_for
 
 FOREGROUND = 127
 """A mask's pixel is foreground if its value, from 0 to 255, is above this."""
+CUT_OFF = 0.02
+"""A mask is cut off if a larger share of one border of its image is foreground."""
+
 TILES = 32
 """The search for the subject's box divides a mask's shorter side into this many tiles."""
 BLOCK = 4
@@ -56,7 +59,10 @@ class HullConfig:
     min_views: int = 2
     """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
-    """Points seen by a smaller share of the cameras count as empty."""
+    """Points seen by a smaller share of the cameras count as empty. Cameras whose image border cuts the subject off do
+    not count here, since they cannot see all of it."""
+    least_fraction: float = 0.25
+    """Points seen by a smaller share of all cameras count as empty in any case, unless `min_fraction` is lower."""
 
 
 Box = tuple[slice, slice, slice]
@@ -138,7 +144,7 @@ def visual_hull(
     """
     check_views(cameras)
     voxels = Cubes.of(bounds, config.resolution)
-    needed = needed_views(len(cameras), config)
+    needed = needed_views(len(cameras), config, count_cut_off(mask, cameras))
     pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
     if _has_kernels(mask):
         values = _carve_cpu(mask, pool, cameras, voxels, needed)
@@ -154,7 +160,7 @@ def occupied_bounds(
 
     The box stays on the CPU, where its numbers decide how many voxels there are.
     """
-    needed = needed_views(len(cameras), config)
+    needed = needed_views(len(cameras), config, count_cut_off(mask, cameras))
     tile = max(1, min(mask.shape[1:]) // TILES)
     if _has_kernels(mask):
         if not bool(mask.any()):
@@ -202,9 +208,25 @@ def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_bloc
     return padded
 
 
-def needed_views(views: int, config: HullConfig) -> int:
-    """How many of `views` cameras must see a point for it to count."""
-    return max(min(config.min_views, views), math.ceil(config.min_fraction * views))
+def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:
+    """How many of `views` cameras must see a point for it to count, `cut_off` of which see a part of the subject."""
+    share = max(config.min_fraction * (views - cut_off), min(config.min_fraction, config.least_fraction) * views)
+    return max(min(config.min_views, views), math.ceil(share))
+
+
+def count_cut_off(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> int:
+    """How many images have a border that cuts the subject of their mask off; reads a device once."""
+    return int(are_cut_off(mask, cameras).sum())
+
+
+def are_cut_off(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bool[Tensor, "view"]:
+    """Whether each mask has foreground along more than `CUT_OFF` of one border of its image, without padding."""
+    width, height = cameras.size_px.to(mask.device).unbind(-1)
+    view = torch.arange(len(mask), device=mask.device)
+    inside = mask > FOREGROUND
+    rows = torch.stack([inside[:, 0], inside[view, height - 1]], 1).sum(-1)
+    columns = torch.stack([inside[:, :, 0], inside[view, :, width - 1]], 1).sum(-1)
+    return ((rows > CUT_OFF * width[:, None]) | (columns > CUT_OFF * height[:, None])).any(-1)
 
 
 def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:

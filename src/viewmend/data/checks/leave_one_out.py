@@ -1,6 +1,6 @@
 """Finds a camera whose masks or pose do not fit: without it, the others agree better."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from viewmend.data.errors import Issue
 from viewmend.data.source import limit_size
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.hull import FOREGROUND, HullConfig
+from viewmend.geometry.hull import FOREGROUND, HullConfig, are_cut_off, count_cut_off
 from viewmend.geometry.line_of_sight import LinesOfSight, Rig
 from viewmend.geometry.proxy import reconstruct
 from viewmend.types import MultiViewFrame
@@ -121,6 +121,8 @@ def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull
     view = int(found.outside.argmax())
     share = float(found.outside[view])
     if share > MAX_OUTSIDE + 3 * float(found.outside.median()):
+        if _is_explained_by_borders(small, bounds, view):
+            return (Issue(_cut_off_text(small)),)
         text = f"camera '{names[view]}': {100 * share:.0f} % of its mask is outside the hull of all others"
         return (_outlier(text, names[view], share > LEAVE_OUT_OUTSIDE),)
     view = int(found.removed.argmax())
@@ -131,6 +133,35 @@ def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull
         text = f"camera '{names[view]}' alone removes {100 * share:.1f} % of the subject that the others see"
         return (_outlier(text, names[view], share > (LEAVE_OUT_OF_FEW if few else LEAVE_OUT_REMOVED)),)
     return ()
+
+
+def _is_explained_by_borders(frame: MultiViewFrame, bounds: Bounds | None, view: int) -> bool:
+    """Whether a camera's mask fits the others wherever these look: their borders cut the subject off."""
+    name = frame.cameras.names[view]
+    others = frame.without([name])
+    own = frame.select([name])
+    assert others.mask is not None
+    assert own.mask is not None
+    if not count_cut_off(others.mask, others.cameras):
+        return False
+    try:
+        proxy = reconstruct(others.mask, others.cameras, bounds, replace(HULL, min_views=0, min_fraction=0.0))
+    except ValueError:
+        return False
+    covered = pad_like(proxy.depth(own.cameras) > 0, own.mask)
+    return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= MAX_OUTSIDE
+
+
+def _cut_off_text(frame: MultiViewFrame) -> str:
+    """Which cameras see a part of the subject only, and what follows."""
+    assert frame.mask is not None
+    cut = are_cut_off(frame.mask, frame.cameras).tolist()
+    names = [name for name, is_cut in zip(frame.cameras.names, cut, strict=True) if is_cut]
+    who = f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    return (
+        f"the subject is cut off by the image border of {who}; parts "
+        "that fewer than two cameras see are missing in views: move these cameras back, or turn them to the subject"
+    )
 
 
 def _outlier(text: str, camera: str, leave_out: bool) -> Issue:
