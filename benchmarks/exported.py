@@ -80,10 +80,12 @@ def compared(net: ViewSynthNet, runners: dict[str, Runner], scenes: int) -> dict
             wrong = torch.stack([image.reshape(-1, *view.mask.shape).amax(0) > TOLERANCE for image in off.values()])
             over[name] += int(wrong.any(0).sum())
             views[name] += bool(wrong.any())
-        print(f"{seed}: {tuple(view.mask.shape)}", {n: max(f["mended_rgb"]) for n, f in furthest.items()}, flush=True)
+        print(
+            f"{seed}: {tuple(view.mask.shape)}", {n: max(f["completed_rgb"]) for n, f in furthest.items()}, flush=True
+        )
     return {
         name: {f"largest_{output}": max(values) for output, values in furthest[name].items()}
-        | {"median_of_largest_rgb": median(furthest[name]["mended_rgb"])}
+        | {"median_of_largest_rgb": median(furthest[name]["completed_rgb"])}
         | {"views_over": views[name], "pixels_over": over[name], "pixels": pixels}
         for name in runners
     }

@@ -49,7 +49,7 @@ def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:
     truth = frame.rgb[0] / 255 * (frame.mask[0] / 255)
 
     # %% Write a picture.
-    picture = folder / "mended.png"
+    picture = folder / "completed.png"
     row = torch.cat([view.rgb, completed, truth], 2).clamp(0, 1)
     write_image(picture, (row * 255).byte().movedim(0, -1).contiguous().numpy())
     print(f"wrote {picture}: rendered, completed, truth")

@@ -44,10 +44,10 @@ def main(out: Path, model: str = "views", size_px: int = 256) -> float:
     session = onnxruntime.InferenceSession(out)
     wanted = {given.name for given in session.get_inputs()}
     arrays = {name: array for name, array in inputs_of(view, cached).items() if name in wanted}
-    [mended_rgb] = session.run(["mended_rgb"], arrays)  # also alpha, confidence and mended_depth
+    [completed_rgb] = session.run(["completed_rgb"], arrays)  # also alpha, confidence and completed_depth
 
     completed, _ = stream.inpainter.step(view, stream.context_provider(), stream.inpainter.initial_state())
-    return float(np.abs(mended_rgb - completed.rgb.numpy()).mean())
+    return float(np.abs(completed_rgb - completed.rgb.numpy()).mean())
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ class Soak:
     def send_malformed(self) -> None:
         """Send malformed messages until the server closes the connection."""
         chance = random.Random(7)
-        whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3}, "modes": ["mended"]})
+        whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3}, "modes": ["completed"]})
         while not self.over:
             with (
                 contextlib.suppress(ConnectionClosed, OSError, TimeoutError),

@@ -49,12 +49,12 @@ def test_a_model_that_paints_on_white_is_scored_on_white(snow):
     step, truth = snow
     view, subject, scores = step.completed.view, truth.mask[0] > 127, step.scores
     assert step.background == "white" and view.holes.sum() > 3
-    for image in (step.mended, step.rendered, step.truth):
+    for image in (step.completed_rgb, step.rendered, step.truth):
         assert float(image[:, ~subject & (view.mask == 0)].min()) == 1
-    assert float(step.mended[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
-    torch.testing.assert_close(step.mended, torch.where(view.error > 0, 1.0, step.rendered))
-    assert scores.ours.psnr_whole == pytest.approx(psnr(step.mended, step.truth))
-    assert scores.ours.ssim_whole == pytest.approx(float(ssim_map(step.mended, step.truth).nanmean()))
+    assert float(step.completed_rgb[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
+    torch.testing.assert_close(step.completed_rgb, torch.where(view.error > 0, 1.0, step.rendered))
+    assert scores.ours.psnr_whole == pytest.approx(psnr(step.completed_rgb, step.truth))
+    assert scores.ours.ssim_whole == pytest.approx(float(ssim_map(step.completed_rgb, step.truth).nanmean()))
     assert scores.unfilled.psnr_whole == pytest.approx(psnr(step.rendered, step.truth))
     telea = Telea().step(replace(view, rgb=step.rendered), ContextProvider(lambda *_: None), State())[0].rgb
     assert scores.telea.psnr_holes == pytest.approx(psnr(telea, step.truth, view.holes), abs=0.01)
@@ -67,11 +67,11 @@ def test_a_model_that_paints_on_white_is_shown_on_white(snow, tmp_path):
     step, _ = snow
     with MendOutput(tmp_path, 15.0) as output:
         output.add(step)
-    for name in ("mended", "rendered", "truth"):
+    for name in ("completed", "rendered", "true"):
         assert (read_rgb(tmp_path / name / "000000.png", name)[:3, :3] == 255).all(), name
     tiles = {tile.label.split(",")[0]: tile.image for tile in sheet_row(step)}
     height, width = step.completed.view.mask.shape
-    for name in ("rendered", "holes", "completed", "truth"):
+    for name in ("rendered", "holes", "completed", "true"):
         assert tiles[name].shape[0] < height and tiles[name].shape[1] < width, "cropped to the subject"
         assert tiles[name][0, 0].tolist() == [255, 255, 255]
-    assert tiles["rendered - truth"][0, 0].tolist() == [0, 0, 0], "white minus white"
+    assert tiles["rendered - true"][0, 0].tolist() == [0, 0, 0], "white minus white"

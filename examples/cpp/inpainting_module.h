@@ -22,7 +22,7 @@ class InpaintingModule {
   // Where the next pictures are taken from, and what the rig's cameras show: all inputs by name but `rgb` and `error`.
   void observe(Tensors seen) { seen_ = std::move(seen); }
 
-  // The picture with its holes mended. `image` is uint8 (height, width, 3 or more), `mask` float (height, width, 1), 1
+  // The image with its holes completed. `image` is uint8 (height, width, 3 or more), `mask` float (height, width, 1), 1
   // where a pixel is missing; what comes back is uint8 (height, width, 3).
   torch::Tensor inpaint(const torch::Tensor& image, const torch::Tensor& mask) {
     torch::InferenceMode guard;
@@ -36,8 +36,8 @@ class InpaintingModule {
         given.push_back(name == "error" ? holes.contiguous() : seen(name));
       }
     }
-    const auto mended = torch::lerp(rgb, model_.run(given)[0], holes);
-    const auto bytes = (mended.clamp(0, 1) * 255 + 0.5).to(torch::kUInt8).permute({1, 2, 0});
+    const auto completed = torch::lerp(rgb, model_.run(given)[0], holes);
+    const auto bytes = (completed.clamp(0, 1) * 255 + 0.5).to(torch::kUInt8).permute({1, 2, 0});
     return upright(bytes).contiguous();
   }
 

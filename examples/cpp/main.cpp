@@ -3,7 +3,7 @@
 //   mend_view MODEL.pt2 VIEW.safetensors OUT.ppm [OUT.safetensors]
 //
 // VIEW holds the model's inputs by name (write_view.py writes one); OUT.ppm is the picture upon black, and
-// OUT.safetensors all that the model tells: mended_rgb, alpha, confidence and mended_depth.
+// OUT.safetensors all that the model tells: completed_rgb, alpha, confidence and completed_depth.
 
 #include <torch/csrc/inductor/aoti_package/model_package_loader.h>
 
@@ -47,11 +47,11 @@ int mend(const std::vector<std::string>& paths) {
   const auto names = split(told.at("outputs"));
   write_picture(paths[2], outputs[0]);
   if (paths.size() > 3) {
-    Tensors mended;
-    for (size_t n = 0; n < names.size(); ++n) mended[names[n]] = outputs[n];
-    write_tensors(paths[3], mended);
+    Tensors completed;
+    for (size_t n = 0; n < names.size(); ++n) completed[names[n]] = outputs[n];
+    write_tensors(paths[3], completed);
   }
-  std::cout << "mended " << outputs[1].size(1) << " x " << outputs[1].size(0) << " pixels by " << inputs[7].size(0)
+  std::cout << "completed " << outputs[1].size(1) << " x " << outputs[1].size(0) << " pixels by " << inputs[7].size(0)
             << " cameras in " << taken.count() << " ms; wrote " << paths[2] << '\n';
   return 0;
 }

@@ -52,7 +52,7 @@ class MendStep:
     times: StageTimes
 
     @property
-    def mended(self) -> Float[Tensor, "3 height width"]:
+    def completed_rgb(self) -> Float[Tensor, "3 height width"]:
         """The completed view on the background."""
         return composite(self.background, self.completed.rgb, self.completed.opacity)
 
@@ -127,7 +127,7 @@ class MendSummary:
         """IoU of each camera, frame by frame."""
         self.empty: set[int] = set()
         """Indices of the frames without a subject in the input cameras."""
-        self._hull_px = self._hole_px = self._mended_px = 0
+        self._hull_px = self._hole_px = self._completed_px = 0
         self._scores: list[FillScores] = []
         self._times: list[StageTimes] = []
 
@@ -137,7 +137,7 @@ class MendSummary:
         self.frames, self.background = self.frames + 1, step.background
         self._hull_px += int((view.mask > 0.5).sum())
         self._hole_px += int(view.holes.sum())
-        self._mended_px += int(((view.mask > 0.5) & view.refine_mask).sum())
+        self._completed_px += int(((view.mask > 0.5) & view.refine_mask).sum())
         if not step.frame.has_subject:
             self.empty.add(step.frame.time)
         if step.scores is not None:
@@ -152,13 +152,13 @@ class MendSummary:
         return self._hole_px / self._hull_px if self._hull_px else None
 
     @property
-    def mended_fraction(self) -> float | None:
+    def completed_fraction(self) -> float | None:
         """Fraction of the hull's pixels that are inpainted; None without a hull."""
-        return self._mended_px / self._hull_px if self._hull_px else None
+        return self._completed_px / self._hull_px if self._hull_px else None
 
     def as_json(self) -> dict[str, object]:
         """The scores of `mend --json`; None where there are no such pixels, or no truth. Times are medians in ms."""
-        whole = ("frames", "protocol", "background", "hole_fraction", "mended_fraction")
+        whole = ("frames", "protocol", "background", "hole_fraction", "completed_fraction")
         return {
             **{name: getattr(self, name) for name in whole},
             "psnr_whole": self.mean("ours", "psnr_whole"),

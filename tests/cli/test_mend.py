@@ -26,7 +26,7 @@ from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import picture
 
 KEYS = [
-    "frames", "protocol", "background", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered",
+    "frames", "protocol", "background", "hole_fraction", "completed_fraction", "psnr_whole", "psnr_whole_rendered",
     "ssim_whole", "lpips_whole", "lpips_subject", "psnr_subject", "alpha_iou",
     "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou",
     "stage_ms",
@@ -49,7 +49,7 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, mend):
     assert holes.shape == (2, 48, 48) and set(np.unique(holes)) <= {0, 255}
     assert report["hole_fraction"] == pytest.approx((holes > 0).sum() / 2 / 900, rel=0.3)
     assert {f.name for f in (tmp_path / "out").iterdir()} == {
-        ".viewmend", "mended.mp4", "compared.mp4", "holes", "rendered", "truth", "contact_sheet.png",
+        ".viewmend", "completed.mp4", "compared.mp4", "holes", "rendered", "true", "contact_sheet.png",
     }  # fmt: skip
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
@@ -73,8 +73,8 @@ def test_the_whole_subject_may_be_mended(folder, tmp_path, mend):
     _, unseen, _ = mend(folder, tmp_path / "a", *given)
     _, whole, _ = mend(folder, tmp_path / "b", *given, "--error-rule", "all")
     assert unseen["psnr_whole"] != pytest.approx(whole["psnr_whole"], abs=0.5)
-    assert unseen["mended_fraction"] == unseen["hole_fraction"] == whole["hole_fraction"] < 0.5
-    assert whole["mended_fraction"] == 1
+    assert unseen["completed_fraction"] == unseen["hole_fraction"] == whole["hole_fraction"] < 0.5
+    assert whole["completed_fraction"] == 1
     same = ["psnr_whole_rendered", "psnr_holes_telea", "psnr_holes", "alpha_iou"]
     assert {key: whole[key] for key in same} == pytest.approx({key: unseen[key] for key in same}, abs=1e-4)
     assert whole["psnr_valid"] < unseen["psnr_valid"]
@@ -87,7 +87,9 @@ def test_the_whole_view_is_scored(folder, tmp_path, mend):
     prepared = prepare(open_masked(folder), [f"c{n}" for n in range(6)])
     truth = prepared.read(1).select(["held"])
     image, mask = truth.rgb[0] / 255 * (truth.mask[0] / 255), truth.mask[0] > 127
-    seen = torch.from_numpy(cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1] / 255).movedim(-1, 0)
+    seen = torch.from_numpy(cv2.imread(str(tmp_path / "out" / "completed" / "000000.png"))[..., ::-1] / 255).movedim(
+        -1, 0
+    )
     assert report["psnr_whole"] == pytest.approx(psnr(seen, image), abs=0.02)
     assert report["psnr_subject"] == pytest.approx(psnr(seen, image, mask), abs=0.02)
     assert report["ssim_whole"] == pytest.approx(float(ssim_map(seen, image).nanmean()), abs=1e-3)
@@ -101,13 +103,13 @@ def pictures(folder, flags=cv2.IMREAD_COLOR_RGB):
 
 def test_rendered_views_and_the_truth_lie_beside_the_mended_ones(folder, tmp_path, mend):
     mend(folder, tmp_path, "--leave-out", "held", "--frames", "1:2")
-    rendered, mended, truth = (pictures(tmp_path / name)[0] for name in ("rendered", "mended", "truth"))
+    rendered, mended, truth = (pictures(tmp_path / name)[0] for name in ("rendered", "completed", "true"))
     holes = pictures(tmp_path / "holes", 0)[0] > 0
     assert (rendered[holes] == 0).all() and (mended[holes] > 0).any() and (rendered == mended)[~holes].all()
     true = prepare(open_masked(folder), [f"c{n}" for n in range(6)]).read(1).select(["held"])
     assert np.abs(truth - picture(true.rgb[0] / 255 * (true.mask[0] / 255)).astype(int)).max() <= 1
     mend(folder, tmp_path, "--path", "orbit:seconds=0.2")  # without ground truth
-    assert not (tmp_path / "truth").exists() and (tmp_path / "compared.mp4").exists()
+    assert not (tmp_path / "true").exists() and (tmp_path / "compared.mp4").exists()
 
 
 def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, mend):
@@ -151,7 +153,7 @@ def test_what_the_camera_left_out_saw_changes_scores_alone(folder, tmp_path, men
         mend(given, tmp_path / out, "--leave-out", "held", "--frames", "1:2")
         for given, out in ((folder, "a"), (other, "b"))
     ]
-    pictures = [cv2.imread(str(tmp_path / out / "mended" / "000000.png")) for out in "ab"]
+    pictures = [cv2.imread(str(tmp_path / out / "completed" / "000000.png")) for out in "ab"]
     assert np.array_equal(*pictures) and pictures[0].std() > 20
     assert runs[0][1]["hole_fraction"] == runs[1][1]["hole_fraction"]
     assert runs[0][1]["psnr_whole"] > runs[1][1]["psnr_whole"] + (10 if how == "white" else 3)
@@ -167,7 +169,7 @@ def test_an_orbit_shows_the_whole_motion(folder, tmp_path, mend):
     assert subject.any((1, 2)).all() and not subject[:, [0, -1]].any() and not subject[:, :, [0, -1]].any()
     rows = subject.any((0, 2)).nonzero()[0]
     assert rows[-1] - rows[0] > 30, "it fills the image"
-    with av.open(str(tmp_path / "out" / "mended.mp4")) as film:
+    with av.open(str(tmp_path / "out" / "completed.mp4")) as film:
         assert film.streams.video[0].average_rate == 12
     assert report["psnr_whole"] is None and report["psnr_holes_telea"] is None
     assert report["hole_fraction"] < 0.9 and min(report["hull_iou"].values()) > 0.9
@@ -199,7 +201,7 @@ def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):
         (view,) = renderer.render(RenderRequest(0, (camera,), RenderQuality()), None).completed
     finally:
         source.stop()
-    mended = cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1]
+    mended = cv2.imread(str(tmp_path / "out" / "completed" / "000000.png"))[..., ::-1]
     assert mended.std() > 20 and np.abs(picture(view.rgb).astype(int) - mended).max() <= 1
 
 
@@ -217,7 +219,7 @@ def test_frames_without_a_subject_show_the_background_and_keep_their_time(away, 
     assert "2 of 5 frames have no subject ('000', '003'); they show the background" in said
     seen = [cv2.imread(str(file)).any() for file in sorted((tmp_path / "out" / "rendered").iterdir())]
     assert seen == [False, True, True, False, True]
-    with av.open(str(tmp_path / "out" / "mended.mp4")) as film:
+    with av.open(str(tmp_path / "out" / "completed.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 5
     assert 20 < report["psnr_whole"] < 30, "empty frames, of 100 dB, are not scored"
 

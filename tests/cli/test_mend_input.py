@@ -93,7 +93,7 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
     for said in (False, True):  # its own results are
         code, _, err = mend(folder, tmp_path, *given)
         assert code == 0 and (f"{tmp_path}: the results of an earlier run will be replaced" in err) == said
-    written = {".viewmend", "holes", "mended", "rendered", "truth", "contact_sheet.png"}
+    written = {".viewmend", "holes", "completed", "rendered", "true", "contact_sheet.png"}
     assert {f.name for f in tmp_path.iterdir()} == written
 
 

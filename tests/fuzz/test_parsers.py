@@ -162,7 +162,12 @@ def test_bvh(tmp_path):
 
 
 def test_live_messages():
-    look = {"type": "look", "id": 1, "camera": {"azimuth": 3, "target": [1, 2, 3], "R": [1.0] * 9}, "modes": ["mended"]}
+    look = {
+        "type": "look",
+        "id": 1,
+        "camera": {"azimuth": 3, "target": [1, 2, 3], "R": [1.0] * 9},
+        "modes": ["completed"],
+    }
     camera = {"name": "a", "width": 48, "height": 48, "K": [50, 0, 24, 0, 50, 24, 0, 0, 1]}
     camera |= {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "T": [0, 0, 1]}
     rig = {"type": "rig", "version": 1, "cameras": [camera], "up": [0, 1, 0]}

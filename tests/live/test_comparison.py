@@ -94,7 +94,7 @@ def test_errors_and_score_over_http(ball: Running):
     status, headers, content = get(asked)
     assert status == 200 and 5 < float(headers["X-Viewmend-PSNR"]) < 60
     assert decode(content).shape[:2] == tuple(CAMERAS.size_px[2].tolist()[::-1])
-    assert get(f"{ball.url}/frame.jpg?time=0&mode=mended")[1]["X-Viewmend-PSNR"] is None
+    assert get(f"{ball.url}/frame.jpg?time=0&mode=completed")[1]["X-Viewmend-PSNR"] is None
     for wrong in ("mode=error", "mode=compared", "model=../views", "camera=none", "without=" + ",".join(CAMERAS.names)):
         status, _, content = get(f"{ball.url}/frame.jpg?time=0&{wrong}")
         assert status == 400 and "expected" in json.loads(content)["error"], wrong
@@ -115,7 +115,7 @@ def test_assets_without_a_camera(ball: Running):
 def test_a_viewer_leaves_a_camera_out_and_compares(ball: Running):
     with Client(ball.ws) as viewer:
         assert "paper-small" in viewer.messages["welcome"]["models"]
-        look = {"width": 48, "height": 48, "modes": ["mended", "compared"], "model": "paper-small"}
+        look = {"width": 48, "height": 48, "modes": ["completed", "compared"], "model": "paper-small"}
         shown = viewer.frame(viewer.look(**look, without=[LEFT_OUT], camera={"azimuth": 75}))
         assert LEFT_OUT not in shown.header["source_views"] and len(shown.header["depth_m"]) == 2
         mended, compared = (image.astype(int) for image in shown.images.values())

@@ -12,9 +12,9 @@ from viewmend.models.smooth_fill import SmoothFill
 
 def test_every_mode(ball_view):
     rgb = (ball_view.rgb.movedim(0, -1) * 255).numpy()
-    images = {mode: draw_mode(ball_view, mode) for mode in ("rendered", "holes", "mended", "depth", "coverage")}
+    images = {mode: draw_mode(ball_view, mode) for mode in ("rendered", "holes", "completed", "depth", "coverage")}
     assert all(image.shape == (48, 48, 3) and image.dtype == np.uint8 for image in images.values())
-    assert np.abs(images["mended"] - rgb).max() <= 1
+    assert np.abs(images["completed"] - rgb).max() <= 1
     assert images["rendered"][22, 22].tolist() == [0, 0, 0]
     assert images["holes"][22, 22].tolist() == [255, 38, 140] == images["coverage"][22, 22].tolist()
     assert (images["holes"][12] == images["rendered"][12]).all()
@@ -78,7 +78,7 @@ def test_depth_without_a_surface():
     assert np.allclose(unpack_depth(pack_depth(torch.full((20, 20), 2.0), 4)), 2.0, atol=1e-4)
 
 
-@pytest.mark.parametrize("mode", ["mended", "rendered", "holes", "depth", "coverage", "confidence"])
+@pytest.mark.parametrize("mode", ["completed", "rendered", "holes", "depth", "coverage", "confidence"])
 def test_every_mode_is_drawn_on_the_background(ball_view, mode):
     black, blue = draw_mode(ball_view, mode), draw_mode(ball_view, mode, "0040ff")
     empty, solid = ball_view.view.mask == 0, ball_view.opacity == 1
@@ -101,7 +101,7 @@ def test_the_default_background_is_the_models():
 
     with running(inpainter=OnWhite()) as server, Client(server.ws) as viewer:
         assert viewer.messages["welcome"]["background"] == "ffffff"
-        images = [viewer.frame(viewer.look(width=64, height=48)).images[0, "mended"]]
+        images = [viewer.frame(viewer.look(width=64, height=48)).images[0, "completed"]]
         url = f"{server.url}/frame.jpg?time=0&width=64&height=48"
         images += [decode(get(url + query)[2]) for query in ("", "&background=000000")]
         assert [round(float(image[:4, :4].mean())) for image in images] == [255, 255, 0]

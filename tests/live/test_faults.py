@@ -17,7 +17,7 @@ from viewmend.live.protocol import Limits
 
 def malformed(chance: random.Random):
     """One malformed message: random data, part of a message, or a message with an invalid value."""
-    whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3, "target": [1, 2, 3]}, "modes": ["mended"]})
+    whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3, "target": [1, 2, 3]}, "modes": ["completed"]})
     wrong = chance.choice([None, -1, 1e30, "x", [], {}, True, [[1]], {"a": {}}, 0.5])
     key = chance.choice(["type", "width", "camera", "modes", "eyes", "scale", "moving", "quality", "id", "codec"])
     return chance.choice(

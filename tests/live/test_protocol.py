@@ -23,8 +23,10 @@ def test_every_message_is_parsed():
     assert said(type="clock", seek=4, speed=2) == ClockChange(None, 2.0, 4, False)
     assert said(type="clock", playing=False, live=True) == ClockChange(False, None, None, True)
     assert said(type="look") == Look()
-    look = said(type="look", id=7, camera={"azimuth": 20, "target": [1, 2, 3]}, modes=["holes", "mended"], top_k=None)
-    assert look.cameras == (Camera(azimuth=20.0, target=(1.0, 2.0, 3.0)),) and look.modes == ("holes", "mended")
+    look = said(
+        type="look", id=7, camera={"azimuth": 20, "target": [1, 2, 3]}, modes=["holes", "completed"], top_k=None
+    )
+    assert look.cameras == (Camera(azimuth=20.0, target=(1.0, 2.0, 3.0)),) and look.modes == ("holes", "completed")
     two = said(type="look", eyes=[{"fx": 100}, {"fx": 100, "cx": 3}])
     assert two.cameras == (Camera(fx=100.0), Camera(fx=100.0, cx=3.0))
     turned = said(type="look", camera={"R": [0, 1, 0, -1, 0, 0, 0, 0, 1], "T": [0, 0, 2], "fov_y": 40})
@@ -39,7 +41,10 @@ def test_every_message_is_parsed():
         ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
         ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),
         ({"type": "look", "width": 99.5}, "a whole number"),
-        ({"type": "look", "modes": ["mended", "mendet"]}, 'expected rendered or holes or .* or points, got "mendet"'),
+        (
+            {"type": "look", "modes": ["completed", "completet"]},
+            'expected rendered or holes or .* or points, got "completet"',
+        ),
         ({"type": "look", "error_rule": "some"}, 'error_rule: expected .*, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
         ({"type": "look", "modes": ["compared"]}, "expected 'model' for the mode 'compared'"),

@@ -38,7 +38,7 @@ def test_pushed_frames_are_shown_at_the_edge_and_can_be_sought():
             look = viewer.look(camera={"azimuth": 200.0}, width=48, height=48, quality=95)
             shown = viewer.frame(look)
             right = true_image(server.service.renderer.home, (48, 48), azimuth=200.0)
-            assert shown.header["time"] == 2 and np.abs(shown.images[0, "mended"] - right.astype(float)).mean() < 14
+            assert shown.header["time"] == 2 and np.abs(shown.images[0, "completed"] - right.astype(float)).mean() < 14
             rig.push(photograph(CAMERAS).without(["c7"]))
             assert viewer.frame().header["time"] == 3
             viewer.send("clock", seek=1, playing=False)
@@ -164,7 +164,7 @@ def test_an_empty_frame_shows_the_background():
                 rig.push(replace(frame, mask=mask))
                 while (shown := viewer.frame()).header["time"] < time:
                     pass
-                assert (shown.images[0, "mended"].max() > 50) == bool(mask.any())
+                assert (shown.images[0, "completed"].max() > 50) == bool(mask.any())
 
 
 def test_the_client_refuses_frames_without_masks():

@@ -36,7 +36,7 @@ def served(capture, model, align=True):
         camera = view_camera(Camera(azimuth=renderer.home.azimuth + 25), renderer.home, SIZE_PX)
         result = renderer.render(RenderRequest(0, (camera,), RenderQuality()), None)
         assert renderer.model_error is None
-        return draw_mode(result.completed[0], "mended"), camera
+        return draw_mode(result.completed[0], "completed"), camera
     finally:
         source.stop()
 
@@ -50,7 +50,7 @@ def test_serve_and_mend_show_the_same_pixels_of_wd2(shared, tmp_path, model):
     (tmp_path / "path.json").write_text(json.dumps(path))
     options = ["--path", tmp_path / "path.json", "--frames", "0:1", "--model", model, "--out", tmp_path / "out"]
     assert main(["mend", str(capture), *map(str, options)]) == 0
-    (written,) = (tmp_path / "out/mended").glob("*.png")
+    (written,) = (tmp_path / "out/completed").glob("*.png")
     command = cv2.imread(str(written))[..., ::-1]
     assert command.shape == (360, 480, 3) and command.any(2).mean() > 0.05
     off = np.abs(command.astype(int) - page.astype(int)).max(2)

@@ -53,7 +53,7 @@ def test_health_and_metrics(ball):
 def test_an_image_from_a_requested_camera(ball):
     home = ball.service.renderer.home
     for azimuth in (20, 200):
-        status, headers, body = get(f"{ball.url}/frame.jpg?azimuth={azimuth}&time=0&width=64&height=48&mode=mended")
+        status, headers, body = get(f"{ball.url}/frame.jpg?azimuth={azimuth}&time=0&width=64&height=48&mode=completed")
         image = decode(body)
         assert status == 200 and image.shape == (48, 64, 3) and headers["x-viewmend-time"] == "0"
         timing = dict(part.split(";dur=") for part in headers["server-timing"].split(", "))
@@ -90,18 +90,18 @@ def test_invalid_queries_are_refused(ball, query, words):
 def test_a_viewer_gets_its_view_and_frame(ball):
     with Client(ball.ws) as viewer:
         welcome = viewer.messages["welcome"]
-        assert welcome["version"] == 1 and welcome["modes"][2] == "mended" and welcome["limits"]["viewers"] == 8
+        assert welcome["version"] == 1 and welcome["modes"][2] == "completed" and welcome["limits"]["viewers"] == 8
         rig = viewer.wait_for("rig")
         assert [camera["name"] for camera in rig["cameras"]] == list(CAMERAS.names) and rig["name"] == "ball"
         viewer.send("clock", playing=False, seek=0)
         look = viewer.look(
-            camera={"azimuth": 200.0}, width=64, height=64, modes=["rendered", "mended"], depth=True, quality=95
+            camera={"azimuth": 200.0}, width=64, height=64, modes=["rendered", "completed"], depth=True, quality=95
         )
         shown = viewer.frame(look, full=True)
-        assert set(shown.images) == {(0, "rendered"), (0, "mended")} and shown.header["time"] == 0
+        assert set(shown.images) == {(0, "rendered"), (0, "completed")} and shown.header["time"] == 0
         right = true_image(ball.service.renderer.home, (64, 64), azimuth=200.0)
         errors = {mode: np.abs(image - right.astype(float)).mean() for (_, mode), image in shown.images.items()}
-        assert errors["mended"] < 12 and errors["mended"] < errors["rendered"]
+        assert errors["completed"] < 12 and errors["completed"] < errors["rendered"]
         assert shown.depth[0].shape == (64, 64) and 1.4 < shown.depth[0][32, 32] < 1.6
         assert 0 < shown.latency_ms < 20_000
         while (state := viewer.messages["state"])["playing"]:
@@ -118,7 +118,7 @@ def test_a_viewer_chooses_the_error_rule(ball):
         for rule in (None, ERROR_RULE, "all"):
             look = viewer.look(width=64, height=64, error_rule=rule)
             shown[rule] = viewer.frame(look, full=True)
-    own, holes, whole = (frame.images[0, "mended"].astype(int) for frame in shown.values())
+    own, holes, whole = (frame.images[0, "completed"].astype(int) for frame in shown.values())
     assert (own == holes).all()
     assert np.abs(whole - own).mean() > 5, "the ball is filled from its black surroundings"
     assert shown["all"].header.get("confidence") is None
@@ -131,9 +131,9 @@ def test_stereo_views_have_two_eyes_of_one_frame(ball):
     with Client(ball.ws) as viewer:
         eyes = [{"azimuth": 100.0}, {"azimuth": 103.0}]
         shown = viewer.frame(viewer.look(eyes=eyes, width=48, height=48, depth=True))
-        assert set(shown.images) == {(0, "mended"), (1, "mended")} and set(shown.depth) == {0, 1}
+        assert set(shown.images) == {(0, "completed"), (1, "completed")} and set(shown.depth) == {0, 1}
         assert len(shown.header["cameras"]) == 2
-        assert np.abs(shown.images[0, "mended"].astype(int) - shown.images[1, "mended"]).mean() > 0.5
+        assert np.abs(shown.images[0, "completed"].astype(int) - shown.images[1, "completed"]).mean() > 0.5
 
 
 def test_playback_pauses_seeks_and_follows_the_edge(ball):
@@ -215,7 +215,7 @@ def read_video(video: bytes):
 
 def test_a_path_becomes_a_video(ball):
     poses = [{"azimuth": 20.0 * n} for n in range(5)]
-    body = {"poses": poses, "times": [0, 0, 1, 1, 2], "fps": 10, "width": 64, "height": 48, "mode": "mended"}
+    body = {"poses": poses, "times": [0, 0, 1, 1, 2], "fps": 10, "width": 64, "height": 48, "mode": "completed"}
     status, headers, video = get(f"{ball.url}/path.mp4", data=json.dumps(body).encode())
     assert status == 200 and headers["content-type"] == "video/mp4", video
     frames, fps = read_video(video)
@@ -306,7 +306,7 @@ def test_a_failing_model_leaves_holes_and_recovers(said):
     with running(inpainter=model) as server, Client(server.ws) as viewer:
 
         def image():
-            return viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "mended"]
+            return viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "completed"]
 
         viewer.send("clock", seek=0, playing=False)
         good = image()

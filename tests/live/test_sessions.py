@@ -237,14 +237,14 @@ def test_only_some_modes_need_inpainting():
     desk = Desk()
     desk.look(id=1, modes=("rendered", "holes"))
     assert not desk.due().quality.mend
-    desk.look(id=2, modes=("rendered", "mended"))
+    desk.look(id=2, modes=("rendered", "completed"))
     assert desk.due().quality.mend
     desk.look(id=3, modes=("confidence",), error_rule="all")
     request = desk.due()
     assert request.quality.mend and request.error_rule == "all"
 
 
-@pytest.mark.parametrize("mode", ["mended", "depth"])
+@pytest.mark.parametrize("mode", ["completed", "depth"])
 def test_the_header_describes_the_frame(ball_view, mode):
     desk = Desk()
     desk.look(id=5, sent_ms=12.5, modes=(mode,), depth=True)

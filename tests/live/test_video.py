@@ -73,7 +73,7 @@ def test_a_viewer_chooses_a_codec():
         for codec in (*video_codecs(), "jpeg"):
             keys = []
             for key in (False, False, True):
-                look = {"type": "look", "codec": codec, "width": 48, "height": 48, "modes": ["rendered", "mended"]}
+                look = {"type": "look", "codec": codec, "width": 48, "height": 48, "modes": ["rendered", "completed"]}
                 viewer.send(json.dumps(look | {"key": key}))
                 header, parts = next_frame(viewer)
                 assert [part["codec"] for part in header["parts"]] == [codec, codec]

@@ -60,8 +60,8 @@ def images(completed: CompletedView) -> dict[str, torch.Tensor]:
     """What an export gives, by the names of its outputs."""
     assert completed.confidence is not None
     return {
-        "mended_rgb": completed.rgb,
+        "completed_rgb": completed.rgb,
         "alpha": completed.opacity,
         "confidence": completed.confidence,
-        "mended_depth": completed.surface_depth,
+        "completed_depth": completed.surface_depth,
     }

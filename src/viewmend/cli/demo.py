@@ -107,7 +107,7 @@ def _write(out: Path, steps: "Sequence[MendStep]") -> None:
     panels = []
     for step in steps:
         assert step.truth is not None, "synthetic scenes have a truth"
-        images = {"rendered": step.rendered, "completed": step.mended, "truth": step.truth}
+        images = {"rendered": step.rendered, "completed": step.completed_rgb, "true": step.truth}
         panels.append(side_by_side({name: picture(image) for name, image in images.items()}))
     write_mp4(out / "demo.mp4", panels, FPS)
     chosen: list[int] = []

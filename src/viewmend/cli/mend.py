@@ -21,16 +21,17 @@ if TYPE_CHECKING:
 class Options:
     """Render novel views of a capture and inpaint them.
 
-    OUT gets the inpainted views (mended.mp4, or mended/*.png for a single view), the views as rendered
-    (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be inpainted), the ground truth of a
-    held-out camera (truth/*.png), rendered, mended and true views side by side (compared.mp4), and contact_sheet.png.
+    OUT gets the completed views (completed.mp4, or completed/*.png for a single view), the views as rendered
+    (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be completed), the true image of a
+    held-out camera (true/*.png), rendered, completed and true views side by side (compared.mp4), and
+    contact_sheet.png.
 
     With --leave-out, that camera's view is rendered without its image and mask, which then score it. PSNR in dB: of the
     whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
     ("valid"), and of the holes ("fg": inside the true mask), the holes also for OpenCV's Telea fill. SSIM: of the
     whole image. LPIPS (AlexNet): of the whole image and of the subject. IoU: of alpha and the true mask. PSNRs are
     means over frames; in the holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of
-    the hull's pixels that are holes, mended_fraction the fraction to be inpainted.
+    the hull's pixels that are holes, completed_fraction the fraction to be completed.
 
     Images and scores are on a black background, or on white for a model trained on white (paper-small).
     """

@@ -21,8 +21,8 @@ from viewmend.utils.output_folder import OutputFolder
 
 SHEET_ROWS = 4
 RESULTS = (
-    *("mended", "holes", "rendered", "truth", "cutout", "depth"),
-    *("mended.mp4", "compared.mp4", "cutout.webm", "contact_sheet.png"),
+    *("completed", "holes", "rendered", "true", "cutout", "depth"),
+    *("completed.mp4", "compared.mp4", "cutout.webm", "contact_sheet.png"),
 )
 HOLE_COLOUR = (1.0, 0.0, 1.0)
 DIFFERENCE_GAIN = 3.0
@@ -61,8 +61,8 @@ class MendOutput:
     def add(self, step: MendStep) -> None:
         """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
         completed, number = step.completed, f"{self._count:06d}.png"
-        shown = {"mended": step.mended, "holes": completed.view.error[None], "rendered": step.rendered}
-        for name, image in (shown if step.truth is None else shown | {"truth": step.truth}).items():
+        shown = {"completed": step.completed_rgb, "holes": completed.view.error[None], "rendered": step.rendered}
+        for name, image in (shown if step.truth is None else shown | {"true": step.truth}).items():
             write_image(self._draft / name / number, picture(image))
         if self._alpha:
             write_image(self._draft / "cutout" / number, cutout(completed))
@@ -86,16 +86,16 @@ class MendOutput:
             self._folder.__exit__()
 
     def _write_videos(self) -> None:
-        """Encode the images as videos; mended.mp4 replaces its images."""
-        write_mp4(self._draft / "mended.mp4", self._read("mended"), self._fps)
-        kinds = [name for name in ("rendered", "mended", "truth") if (self._draft / name).is_dir()]
+        """Encode the images as videos; completed.mp4 replaces its images."""
+        write_mp4(self._draft / "completed.mp4", self._read("completed"), self._fps)
+        kinds = [name for name in ("rendered", "completed", "true") if (self._draft / name).is_dir()]
         sides = zip(*(self._read(name) for name in kinds), strict=True)
         panels = (side_by_side(dict(zip(kinds, images, strict=True))) for images in sides)
         write_mp4(self._draft / "compared.mp4", panels, self._fps)
         if self._alpha:
             cut = (read_rgba(file, str(file)) for file in self._images("cutout"))
             write_webm(self._draft / "cutout.webm", cut, self._fps)
-        shutil.rmtree(self._draft / "mended")
+        shutil.rmtree(self._draft / "completed")
 
     def _images(self, name: str) -> list[Path]:
         return sorted((self._draft / name).glob("*.png"))
@@ -116,7 +116,7 @@ def side_by_side(images: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt
 
 
 def sheet_row(step: MendStep) -> list[Tile]:
-    """Source cameras, rendered, holes, completed, alpha and confidence, truth, differences; cropped to the subject."""
+    """Source cameras, rendered, holes, completed, alpha and confidence, true, differences; cropped to the subject."""
     completed, view, truth = step.completed, step.completed.view, step.truth
     empty = float(step.background == "white")
     box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth != empty).any(0))
@@ -127,12 +127,12 @@ def sheet_row(step: MendStep) -> list[Tile]:
         tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > FOREGROUND)]))
     magenta = torch.tensor(HOLE_COLOUR, device=step.rendered.device)[:, None, None]
     holes = torch.where(view.holes, magenta, step.rendered)
-    images = {f"rendered, frame {view.time}": step.rendered, "holes": holes, "completed": step.mended}
+    images = {f"rendered, frame {view.time}": step.rendered, "holes": holes, "completed": step.completed_rgb}
     images |= {name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")}
     if truth is not None:
-        images["truth"] = truth
-        for name, rgb in {"rendered": step.rendered, "completed": step.mended}.items():
-            images[f"{name} - truth, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
+        images["true"] = truth
+        for name, rgb in {"rendered": step.rendered, "completed": step.completed_rgb}.items():
+            images[f"{name} - true, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
     return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 
@@ -151,7 +151,7 @@ def in_words(summary: MendSummary) -> list[str]:
     iou = [value for values in summary.hull_iou.values() for value in values]
     lines = [
         f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
-        f"of the hull's pixels, {100 * (summary.mended_fraction or 0):.2f} % to be inpainted; "
+        f"of the hull's pixels, {100 * (summary.completed_fraction or 0):.2f} % to be completed; "
         + (f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}" if iou else "no subject"),
         "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
     ]

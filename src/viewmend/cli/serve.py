@@ -29,7 +29,7 @@ RAY_SETTINGS, SERVE_ON_RAY = "viewmend.contrib.ray.replicas:ManyViewers", "viewm
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Serve a web page for moving around the subject, live: as rendered, with holes, or inpainted.
+    """Serve a web page for moving around the subject, live: as rendered, with holes, or completed.
 
     The command prints the page's address. Only this machine can open it unless --host and --token are given. See
     docs/live.md for the page, the time budget, single images over HTTP and live rigs.

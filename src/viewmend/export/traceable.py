@@ -129,13 +129,13 @@ class ViewInputs(NamedTuple):
 class ViewOutputs(NamedTuple):
     """The completed view: the exported model's outputs, in this order. Where E is 0, the view is unchanged."""
 
-    mended_rgb: Float[Tensor, "3 height width"]
+    completed_rgb: Float[Tensor, "3 height width"]
     """Fhat, in [0, 1], on black."""
     alpha: Float[Tensor, "height width"]
     """Fraction of each pixel that the subject covers, in [0, 1]."""
     confidence: Float[Tensor, "height width"]
     """Probability that the pixel is correct, in [0, 1]."""
-    mended_depth: Float[Tensor, "height width"]
+    completed_depth: Float[Tensor, "height width"]
     """z-depth of the subject, metres; 0 where there is none."""
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.threads import light_operations
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import BLACK, EXTRA_MODES, MENDED_MODES, FrameTimes, Look, pack
+from viewmend.live.protocol import BLACK, COMPLETED_MODES, EXTRA_MODES, FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
 from viewmend.types import FAINT, CompletedView, IncompleteView
@@ -38,10 +38,10 @@ def draw_mode(
 ) -> Image:
     """Draw one of the protocol's modes as 8-bit RGB on a background (hexadecimal RGB).
 
-    rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. mended: Fhat. depth:
-    from red (near) to blue, over `depth_range`. error: from black to yellow (`LARGE_ERROR`). coverage: the colours of
-    the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey where the inpainter
-    does not predict it, or has not yet. The others: as in `RenderResult.extra`.
+    rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. completed: Fhat.
+    depth: from red (near) to blue, over `depth_range`. error: from black to yellow (`LARGE_ERROR`). coverage: the
+    colours of the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey where the
+    inpainter does not predict it, or has not yet. The others: as in `RenderResult.extra`.
     """
     own = (extra or {})[mode] if mode in EXTRA_MODES else None
     if mode == "error" and own is not None:
@@ -52,7 +52,7 @@ def draw_mode(
     if mode == "depth":
         opacity = (completed.view.cut_depth > 0).float()
     else:
-        opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if own is None else own[3]
+        opacity = completed.opacity if mode in COMPLETED_MODES else completed.view.mask if own is None else own[3]
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
     return cv2.add(image, cv2.merge(channels))
@@ -60,7 +60,7 @@ def draw_mode(
 
 def _draw_on_black(completed: CompletedView, mode: str) -> Image:
     view = completed.view
-    if mode == "mended":
+    if mode == "completed":
         return _to_8bit(completed.rgb)
     if mode == "confidence":
         grey = completed.rgb.mean(0).expand(3, -1, -1)
@@ -205,7 +205,7 @@ def encode_frame(
             parts.append(part)
             data.append(encoded)
         if look.depth:
-            depth = surface_depth(completed) if MENDED_MODES.issuperset(look.modes) else completed.view.depth
+            depth = surface_depth(completed) if COMPLETED_MODES.issuperset(look.modes) else completed.view.depth
             stride = next((stride for longest, stride in DEPTH_STRIDES if max(depth.shape) <= longest), COARSEST_STRIDE)
             packed = asdict(pack_depth(depth, stride))
             data.append(packed.pop("data"))

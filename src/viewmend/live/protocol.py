@@ -18,8 +18,8 @@ from viewmend.utils.timing import StageTimes
 from viewmend.utils.untrusted_input import LARGEST_INTEGER, InputError, one_of, read_json, typed
 
 VERSION = 1
-MODES = ("rendered", "holes", "mended", "compared", "depth", "coverage", "confidence", "hull", "points")
-MENDED_MODES = frozenset({"mended", "confidence"})
+MODES = ("rendered", "holes", "completed", "compared", "depth", "coverage", "confidence", "hull", "points")
+COMPLETED_MODES = frozenset({"completed", "confidence"})
 """Modes that need the model's output."""
 EXTRA_MODES = frozenset({"compared", "error", "hull", "points"})
 """Modes that show something else than the server's own model: another one, its errors, or the geometry proxy alone."""
@@ -115,7 +115,7 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     """Left and right eye, instead of `camera`."""
     width: Side = 320
     height: Side = 320
-    modes: Annotated[tuple[Mode, ...], Meta(min_length=1, max_length=2)] = ("mended",)
+    modes: Annotated[tuple[Mode, ...], Meta(min_length=1, max_length=2)] = ("completed",)
     top_k: TopK | None = None
     error_rule: Rule | None = None
     """Which pixels are inpainted; None for the server's default."""

@@ -41,7 +41,7 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
 
     width: protocol.Side = 320
     height: protocol.Side = 320
-    mode: protocol.Mode = "mended"
+    mode: protocol.Mode = "completed"
     top_k: protocol.TopK | None = None
     error_rule: protocol.Rule | None = None
     background: protocol.Colour | None = None
@@ -64,7 +64,7 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
     time: Literal["live"] | protocol.Count = "live"
     camera: protocol.ShortText | None = None
     """A camera of the rig, whose pose, lens and size the view has, and whose image it is scored by."""
-    mode: Annotated[str, one_of(*protocol.MODES, "error")] = "mended"
+    mode: Annotated[str, one_of(*protocol.MODES, "error")] = "completed"
     without: NameList = ""
     token: str = ""
 
@@ -253,7 +253,7 @@ def request_view(
         return None
     camera = view_camera(pose, playback.home, (asked.width, asked.height))
     eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.home.center)
-    quality = RenderQuality(mend=asked.mode in protocol.MENDED_MODES | {"error"}, top_k=asked.top_k)
+    quality = RenderQuality(mend=asked.mode in protocol.COMPLETED_MODES | {"error"}, top_k=asked.top_k)
     return RenderRequest(index, eyes, quality, asked.error_rule, protocol.EXTRA_MODES & {asked.mode}, model=asked.model)
 
 

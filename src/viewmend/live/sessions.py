@@ -12,7 +12,7 @@ from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLe
 from viewmend.live.encoding import Encoders, encode_frame
 from viewmend.live.frame_source import Clock, Span
 from viewmend.live.poses import HomeView, view_camera
-from viewmend.live.protocol import EXTRA_MODES, MENDED_MODES, ClockChange, FrameTimes, Look
+from viewmend.live.protocol import COMPLETED_MODES, EXTRA_MODES, ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
 
@@ -263,7 +263,7 @@ class ViewerSession:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
         quality = RenderQuality(
-            mend=not MENDED_MODES.isdisjoint(look.modes),
+            mend=not COMPLETED_MODES.isdisjoint(look.modes),
             top_k=top_k,
             context_times=level.context_times,
             refine_fraction=level.refine_fraction,

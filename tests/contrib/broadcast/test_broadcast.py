@@ -264,7 +264,7 @@ def test_a_server_without_a_broadcast(ball):
 
 def test_of_two_compared_modes_the_first_is_on_air():
     session = BroadcastSession(idle_service(), SIZE, None)
-    session.look(Look(modes=("rendered", "mended"), moving=True, depth=True, scale=0.5))
+    session.look(Look(modes=("rendered", "completed"), moving=True, depth=True, scale=0.5))
     request = session.next_request(0.0, PLAYBACK)
     assert session.newest_look.modes == ("rendered",) and not request.quality.mend
     assert tuple(request.cameras[0].size_px[0].tolist()) == SIZE

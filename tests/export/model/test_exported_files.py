@@ -151,7 +151,7 @@ def test_the_example_in_cpp_mends_as_the_model(net, package, program, tmp_path):
     height, width = view.mask.shape
     assert (head, size, most) == (b"P6", f"{width} {height}".encode(), b"255")
     picture = torch.frombuffer(bytearray(pixels), dtype=torch.uint8).view(height, width, 3)
-    assert float((picture.movedim(-1, 0) / 255 - wanted["mended_rgb"]).abs().max()) < 0.5 / 255 + 1e-3
+    assert float((picture.movedim(-1, 0) / 255 - wanted["completed_rgb"]).abs().max()) < 0.5 / 255 + 1e-3
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def test_random_views_are_mended_as_the_model_does(net, seed):
         view = holed(view)
         assert int(view.holes.sum()) > 50
     given, wanted = ViewInputs.of(view, context, net.config.num_views), images(mended(net, view, context))
-    assert (wanted["mended_rgb"] - view.rgb).abs().max() > 0.05
+    assert (wanted["completed_rgb"] - view.rgb).abs().max() > 0.05
     for name, got in zip(ViewOutputs._fields, ExportedModel(net)(*given), strict=True):
         off = (got - wanted[name]).abs()
         assert float((off > 1e-3).float().mean()) <= 1e-4, name
@@ -48,8 +48,8 @@ def test_where_e_is_0_pixels_stay_bit_for_bit(net):
     view, context = random_view(2, net, longest=100)
     kept = view.error == 0
     got = ViewOutputs(*ExportedModel(net)(*ViewInputs.of(view, context, 4)))
-    assert int(kept.sum()) > 500 and torch.equal(got.mended_rgb[:, kept], view.rgb[:, kept])
-    assert torch.equal(got.mended_depth[kept], view.depth[kept])
+    assert int(kept.sum()) > 500 and torch.equal(got.completed_rgb[:, kept], view.rgb[:, kept])
+    assert torch.equal(got.completed_depth[kept], view.depth[kept])
 
 
 @pytest.mark.parametrize("size", [(64, 64), (65, 131), (100, 77)])

@@ -86,7 +86,7 @@ def picture(rgb: np.ndarray, z: np.ndarray, points: np.ndarray, mode: str) -> np
     if mode in ("hull", "points"):
         dots = (np.indices(z.shape) % 3 == 0).all(0)
         return np.where((seen & (dots | (mode == "hull")))[..., None], CLAY, 0).astype(np.uint8)
-    fill = {"mended": rgb, "rendered": np.zeros_like(rgb), "holes": np.full_like(rgb, PINK)}[mode]
+    fill = {"completed": rgb, "rendered": np.zeros_like(rgb), "holes": np.full_like(rgb, PINK)}[mode]
     return np.where(hole[..., None], fill, rgb).astype(np.uint8)
 
 

@@ -24,7 +24,7 @@ from viewmend.live.protocol import pack
 from viewmend.live.responses import HEADERS, page_files
 from viewmend.live.video import STRINGS, VideoStream
 
-MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"]
+MODES = ["rendered", "holes", "completed", "depth", "coverage", "confidence", "hull", "points"]
 LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
 
 
@@ -221,7 +221,7 @@ class StandIn:
             cameras.append({"K": K, "R": camera["R"], "T": camera["T"]})
             rgb, z, points = scene.render({**camera, **lens}, width, height, now)
             share = scene.hole_share(z, points)
-            for mode in look.get("modes", ["mended"]):
+            for mode in look.get("modes", ["completed"]):
                 image = scene.picture(rgb, z, points, mode)
                 image[z == 0] = tuple(bytes.fromhex(look.get("background", "000000")))
                 about, content = self._encode(image, look.get("codec", "jpeg"))

@@ -37,7 +37,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
 
 
 def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
-    with opened(browser, ball, query="?time=0&mode=split&left=original&right=mended") as view:
+    with opened(browser, ball, query="?time=0&mode=split&left=original&right=completed") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
         view.page.keyboard.press("n")
         view.until(lambda: view.page.locator("#original-image").evaluate("i => i.complete && i.naturalWidth > 0"))
@@ -67,11 +67,11 @@ def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
 def test_two_models_are_compared(browser, ball):
     with opened(browser, ball, query="?time=0&mode=split") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
-        view.page.locator("#split-left").select_option("mended")
+        view.page.locator("#split-left").select_option("completed")
         view.page.locator("#split-right").select_option("compared:paper-small")
         (session,) = ball.live.registry.sessions
         view.until(
-            lambda: session.newest_look is not None and session.newest_look.modes == ("mended", "compared"),
+            lambda: session.newest_look is not None and session.newest_look.modes == ("completed", "compared"),
             SCREENSHOT_S,
         )
         assert session.newest_look.model == "paper-small"

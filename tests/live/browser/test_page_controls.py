@@ -22,7 +22,7 @@ def choose(view, name: str) -> None:
 def test_modes_show_their_pictures(view):
     seen = {}
     shown = {
-        "Output": "mended",
+        "Completed": "completed",
         "Rendered": "rendered",
         "Holes": "holes",
         "Depth": "depth",
@@ -50,14 +50,14 @@ def test_every_picture_can_be_chosen_and_all_are_seen_at_once_on_a_large_screen(
     assert box["x"] >= 0 and box["x"] + box["width"] <= width
 
 
-DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence", "hull", "points"]
+DIGITS = ["rendered", "holes", "completed", None, "depth", "coverage", "confidence", "hull", "points"]
 
 
 def test_digits_choose_modes(desktop):
     for digit, mode in zip("123456789", DIGITS, strict=True):
         desktop.page.keyboard.press(digit)
         desktop.settle()
-        assert desktop.server.looks[-1]["modes"] == ([mode] if mode else ["rendered", "mended"])
+        assert desktop.server.looks[-1]["modes"] == ([mode] if mode else ["rendered", "completed"])
 
 
 def test_side_by_side_has_a_divider_that_is_dragged(view):
@@ -203,7 +203,7 @@ def test_steps_and_clicks_start_from_what_is_shown(desktop):
 def test_what_the_address_asks_for_must_make_sense(browser, server):
     with opened(browser, server, "desktop", "?sharp=0&mode=foo&left=split&size=big") as view:
         view.settle()
-        assert server.looks[-1]["modes"] == ["mended"]
+        assert server.looks[-1]["modes"] == ["completed"]
 
 
 def test_a_phone_that_is_turned_upright_has_its_tabs(browser, server):

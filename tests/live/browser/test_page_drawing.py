@@ -51,7 +51,7 @@ def rendered(server: Running, time: int, mode: str = "rendered") -> tuple[np.nda
     look = server.live.registry.sessions[0].newest_look
     renderer = server.service.renderer
     camera = view_camera(look.camera, renderer.home, (look.width, look.height))
-    result = renderer.render(RenderRequest(time, (camera,), RenderQuality(mend=mode == "mended")), None)
+    result = renderer.render(RenderRequest(time, (camera,), RenderQuality(mend=mode == "completed")), None)
     view = result.completed[0].view
     picture = draw_mode(result.completed[0], mode, look.background or "000000")
     return picture.astype(int), view.holes.numpy(), view.mask.numpy() > 0
@@ -106,7 +106,7 @@ def test_holes_are_filled_marked_or_black(browser, ball):
     rig = ball.service.renderer.rig_json
     pose = pose_text(rig["home"], rig["center"], 300, 40)
     shown = {}
-    for mode in ("mended", "holes", "rendered"):
+    for mode in ("completed", "holes", "rendered"):
         with silent(ball), opened(browser, ball, query=f"?mode={mode}&time=0&pose={pose}") as view:
             shown[mode] = drawn(view)
             _, holes, mask = rendered(ball, 0)
@@ -114,12 +114,12 @@ def test_holes_are_filled_marked_or_black(browser, ball):
     assert inner.sum() > 100
     assert shown["rendered"][inner].mean() < 8
     assert np.abs(shown["holes"][inner] - np.array([255, 38, 140])).mean() < 8
-    assert (shown["mended"][inner].max(-1) < 20).mean() < 0.01, "no black holes"
-    assert np.abs(shown["mended"] - shown["rendered"])[~holes].mean() < 0.5
+    assert (shown["completed"][inner].max(-1) < 20).mean() < 0.01, "no black holes"
+    assert np.abs(shown["completed"] - shown["rendered"])[~holes].mean() < 0.5
     around, weight = mean_around(shown["rendered"], mask & (shown["rendered"] == shown["holes"]).all(-1))
     among = inner & (weight > 8)
     assert among.sum() > 20
-    assert np.abs(shown["mended"] - around)[among].mean() < 6, "holes continue what is around them"
+    assert np.abs(shown["completed"] - around)[among].mean() < 6, "holes continue what is around them"
 
 
 def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, ball):
@@ -128,7 +128,7 @@ def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, 
         view.page.wait_for_timeout(500)
         shown = view.picture()
         with silent(ball):
-            picture, _, mask = rendered(ball, 0, "mended")
+            picture, _, mask = rendered(ball, 0, "completed")
             assert psnr_in_box(shown, picture, mask, np.zeros_like(mask)) > 30, "as JPEG"
         (session,) = ball.live.registry.sessions
         x, y = view.middle()

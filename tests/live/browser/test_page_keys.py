@@ -64,7 +64,7 @@ def test_the_comparison_ends_where_it_began(browser, desktop):
         desktop.page.keyboard.press(key)
     desktop.settle()
     assert desktop.page.locator("#divider").is_hidden()
-    assert desktop.page.locator("#modes [aria-checked=true]").get_attribute("data-value") == "mended"
+    assert desktop.page.locator("#modes [aria-checked=true]").get_attribute("data-value") == "completed"
 
 
 def test_without_an_original_its_half_shows_the_completed_view_and_says_so(browser, desktop):

@@ -45,14 +45,14 @@ def test_views_that_were_added_become_a_film(view, tmp_path):
     assert "2 views" in view.page.locator("#path-text").inner_text()
     posted, frames = export(view, tmp_path)
     assert posted["fps"] == 30
-    assert posted["mode"] == "mended"
+    assert posted["mode"] == "completed"
     assert (posted["width"], posted["height"]) == (480, 480)
     assert len(posted["poses"]) == len(posted["times"]) == len(frames) == 61
     np.testing.assert_allclose(eye(posted["poses"][0]), eye(first), atol=1e-4)
     np.testing.assert_allclose(eye(posted["poses"][-1]), eye(last), atol=1e-4)
     assert posted["times"] == [(n // 3) % scene.FRAMES for n in range(61)]
     rgb, z, points = scene.render(posted["poses"][0], 480, 480, 0)
-    assert np.abs(frames[0].astype(int) - scene.picture(rgb, z, points, "mended")).mean() < 6
+    assert np.abs(frames[0].astype(int) - scene.picture(rgb, z, points, "completed")).mean() < 6
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
 
 

@@ -12,7 +12,7 @@ def truth(look: dict, height: int, width: int) -> np.ndarray:
     lens = look["camera"]
     x, y = width / look["width"], height / look["height"]
     scaled = {"fx": lens["fx"] * x, "fy": lens["fy"] * y, "cx": lens["cx"] * x, "cy": lens["cy"] * y}
-    return scene.picture(*scene.render({**lens, **scaled}, width, height, 0), "mended").astype(int)
+    return scene.picture(*scene.render({**lens, **scaled}, width, height, 0), "completed").astype(int)
 
 
 def wrong(shown: np.ndarray, expected: np.ndarray) -> float:

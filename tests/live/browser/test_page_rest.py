@@ -97,7 +97,7 @@ def test_choices_are_kept_for_the_next_time(browser, server):
         look = view.server.looks[-1]
         assert look["width"] * look["height"] == pytest.approx(512**2, rel=0.05)
         assert look["adaptive"] is False
-        assert look["modes"] == ["mended"], "the address tells the picture"
+        assert look["modes"] == ["completed"], "the address tells the picture"
         assert not view.page.locator("#adaptive").is_checked()
         view.page.goto(server.url + "?sharp=0&side=256&adaptive=1")
         view.settle()

@@ -116,8 +116,8 @@ class Rgvi(Inpainter):
             image, left = self._pull(view, past, state.flows)
         if bool(left.any()):
             image = fill(image, left, subject)
-        mended = blend(view.rgb, view.error, image, torch.ones_like(view.error))
-        return CompletedView(view, mended), self._remember(mended, past, state.flows if past else ())
+        completed = blend(view.rgb, view.error, image, torch.ones_like(view.error))
+        return CompletedView(view, completed), self._remember(completed, past, state.flows if past else ())
 
     def reveal_truth(self, state: State, truth: Image) -> State:
         """The newest past frame becomes the truth."""

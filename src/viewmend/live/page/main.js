@@ -328,7 +328,7 @@ class Page {
     this.place.update({
       pose: motion.atHome || !motion.goal ? null : poseText(motion.goal),
       time: transport.still < 0 ? null : String(transport.still),
-      mode: settings.get("mode") === "mended" ? null : settings.get("mode"),
+      mode: settings.get("mode") === "completed" ? null : settings.get("mode"),
       without: settings.get("without") || null,
       left: split ? settings.get("left") : null,
       right: split ? settings.get("right") : null,

@@ -2,13 +2,13 @@
 
 /**
  * @typedef {object} Choices
- * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage" | "confidence" | "hull" | "points"} mode
+ * @property {"rendered" | "holes" | "completed" | "split" | "depth" | "coverage" | "confidence" | "hull" | "points"} mode
  * @property {string} left mode on the divider's left, or one of `COMPARED`
  * @property {string} right mode on its right
  * @property {string} without names of cameras that are not used, separated by commas
  * @property {number} divider where it is, 0 to 1 of the free part's width
  * @property {number | null} topK
- * @property {string} errorRule what is mended; "" for what the server was started with
+ * @property {string} errorRule what is completed; "" for what the server was started with
  * @property {number} side pixels of a square with as many pixels as the picture has, at most, while it moves
  * @property {string} size "" for the page's shape, or "WIDTHxHEIGHT"
  * @property {string} codec
@@ -25,10 +25,10 @@
  */
 
 const DEFAULTS = {
-  mode: "mended",
+  mode: "completed",
   without: "",
   left: "rendered",
-  right: "mended",
+  right: "completed",
   divider: 0.5,
   topK: null,
   errorRule: "",
@@ -47,7 +47,7 @@ const DEFAULTS = {
   panel: window.innerHeight > 460,
 };
 
-const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"];
+const PICTURES = ["rendered", "holes", "completed", "depth", "coverage", "confidence", "hull", "points"];
 /** What a split view shows besides: another model's output, the image of the camera that the view is at, and the difference. */
 export const COMPARED = /^(compared:[\w.-]+|original|error)$/;
 /** The mode that the server knows, or the page's own. @param {string} value */
@@ -128,7 +128,7 @@ export class Settings extends EventTarget {
 
   /** The modes that the server must render. @returns {string[]} */
   get modes() {
-    return [...new Set(this.shown.map((value) => (AT_CAMERA.includes(value) ? "mended" : modeOf(value))))];
+    return [...new Set(this.shown.map((value) => (AT_CAMERA.includes(value) ? "completed" : modeOf(value))))];
   }
 
   /** What is shown, from left to right. @returns {string[]} */

@@ -111,7 +111,7 @@ void main() {
   colour = vec4(texelFetch(picture, at, 0).rgb * inside, inside);
 }`;
 
-const HOLES = { rendered: [0, 0, 0, 1], holes: [1, 0.15, 0.55, 1], mended: [0, 0, 0, 0], compared: [0, 0, 0, 0] };
+const HOLES = { rendered: [0, 0, 0, 1], holes: [1, 0.15, 0.55, 1], completed: [0, 0, 0, 0], compared: [0, 0, 0, 0] };
 /** Modes that are drawn here. */
 export const DRAWN_MODES = Object.keys(HOLES);
 

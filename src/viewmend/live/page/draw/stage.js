@@ -236,9 +236,9 @@ export class Stage {
   shownMode(viewer, mode) {
     if (!(mode in this.photos)) return mode;
     const photo = this.photos[mode];
-    if (!photo) return "mended";
+    if (!photo) return "completed";
     const offset = length(sub(eyeOfCamera(viewer), photo.camera.center));
-    return offset > AT_CAMERA * (viewer.distance ?? 1) ? "mended" : mode;
+    return offset > AT_CAMERA * (viewer.distance ?? 1) ? "completed" : mode;
   }
 
   /** A camera's image. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */

@@ -57,7 +57,7 @@ export class CameraList {
   #beginComparison() {
     const { settings } = this;
     this.before = { mode: settings.get("mode"), left: settings.get("left"), right: settings.get("right") };
-    settings.set("left", "mended");
+    settings.set("left", "completed");
     settings.set("right", "original");
     settings.set("mode", "split");
   }

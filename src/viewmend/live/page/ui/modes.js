@@ -9,7 +9,7 @@ import { modeOf } from "../settings.js";
 export const MODES = {
   rendered: "Rendered",
   holes: "Holes",
-  mended: "Output",
+  completed: "Completed",
   split: "Side by side",
   depth: "Depth",
   coverage: "Source cameras",
@@ -19,10 +19,10 @@ export const MODES = {
 };
 
 /** The server's model. */
-let model = MODES.mended;
+let model = MODES.completed;
 /** Of what is shown on one side of the divider. @param {string} value */
 const nameOf = (value) =>
-  ({ ...MODES, mended: model, original: "Original", error: "Error map", compared: value.slice("compared:".length) })[modeOf(value)] ?? value;
+  ({ ...MODES, completed: model, original: "Original", error: "Error map", compared: value.slice("compared:".length) })[modeOf(value)] ?? value;
 
 /** What can be compared, once the server said which models it has. @param {Settings} settings @param {string} own model's name @param {string[]} models the others */
 export function offerModels(settings, own, models) {
@@ -32,7 +32,7 @@ export function offerModels(settings, own, models) {
     const list = byId(`split-${side}`);
     for (const option of [...list.options]) if (!(option.value in MODES)) option.remove();
     list.append(...others.map((value) => element("option", { value, textContent: nameOf(value) })));
-    if (![...list.options].some(({ value }) => value === settings.get(side))) settings.set(side, "mended");
+    if (![...list.options].some(({ value }) => value === settings.get(side))) settings.set(side, "completed");
     list.value = settings.get(side);
     for (const option of list.options) option.textContent = nameOf(option.value);
     byId(`${side}-name`).textContent = nameOf(settings.get(side));
@@ -98,7 +98,7 @@ export function nameSides(settings, shownMode) {
   for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
     const wanted = settings.get(side);
     const isThere = shownMode(modeOf(wanted)) === modeOf(wanted);
-    const text = isThere ? nameOf(wanted) : `${nameOf("mended")} (${nameOf(wanted).toLowerCase()}: only at a camera)`;
+    const text = isThere ? nameOf(wanted) : `${nameOf("completed")} (${nameOf(wanted).toLowerCase()}: only at a camera)`;
     const label = byId(`${side}-name`);
     if (label.textContent !== text) label.textContent = text;
   }

@@ -6,7 +6,7 @@ const STAGES = {
   geometry: ["Geometry", "#4fc3b1"],
   context: ["Context", "#6ea8fe"],
   rendering: ["Rendering", "#f0c04c"],
-  inpainting: ["Mending", "#ef7fa7"],
+  inpainting: ["Completing", "#ef7fa7"],
   encode: ["Encoding", "#a58bf0"],
   wait: ["Waiting", "#56606d"],
 };
