@@ -17,6 +17,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import Background, composite
+from viewmend.predicted_mask import MaskPredictor
 from viewmend.scenes.held_out import Protocol, revealed
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
@@ -74,13 +75,16 @@ class Mender(ViewSequence):
         quality: RenderQuality | None = None,
         error_model: Inpainter | None = None,
         protocol: Protocol = "strict",
+        mask_model: Inpainter | None = None,
     ) -> None:
         """Create a viewer of an empty stream, as `ViewSequence` does.
 
-        `protocol` says what `mend` may know of the mask of the held-out camera.
+        `protocol` says what `mend` may know of the mask of the held-out camera; with 'predicted-mask', `mask_model`
+        predicts it.
         """
         super().__init__(inpainter, config, bounds, exclude, quality, error_model)
         self._protocol: Protocol = protocol
+        self._masks = None if mask_model is None else MaskPredictor(mask_model, self.stream.config, bounds)
         self._scorers: Scorers | None = None
 
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
@@ -94,6 +98,8 @@ class Mender(ViewSequence):
         """
         target_mask, carving = revealed(self._protocol, truth)
         cached = self.add_frame(frame, carving)
+        if self._masks is not None:
+            target_mask = self._masks.predict(cached, target, self._exclude)
         made = self.view(target, frame.time, target_mask=target_mask)
         iou = _input_iou(cached)
         if truth is None:

@@ -1,4 +1,4 @@
-"""The three protocols: what is known of the held-out camera, in the hull, the model's input and the completed view."""
+"""The protocols: what is known of the held-out camera, in the hull, the model's input and the completed view."""
 
 from dataclasses import replace
 
@@ -53,6 +53,31 @@ def test_with_the_target_mask_nothing_outside_of_it_is_painted():
     assert torch.equal(cut.rendered, strict.rendered * mask)
     assert cut.scores.ours.psnr_whole > strict.scores.ours.psnr_whole + 1
     assert cut.scores.ours.hole_px == strict.scores.ours.hole_px, "the same holes in every protocol"
+
+
+class HalfTheSubject(SmoothFill):
+    """Predicts that the right half of a view is background."""
+
+    def step(self, view, context, state):
+        completed, state = super().step(view, context, state)
+        alpha = view.mask.clone()
+        alpha[:, alpha.shape[1] // 2 :] = 0
+        return replace(completed, alpha=alpha), state
+
+
+def test_a_predicted_mask_cuts_the_view_and_the_truth_is_not_looked_at():
+    mender = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject())
+    frame = BallCapture(ring(6), 1).read(0)
+    truth = truth_with_half_a_mask()
+    step = mender.mend(frame, TARGET, truth)
+    used = step.completed.view.target_mask
+    assert used.any() and not used[:, used.shape[1] // 2 :].any()
+    assert torch.equal(step.completed.opacity, step.completed.view.mask * used)
+    assert not step.completed.rgb[:, used == 0].any()
+    emptied = replace(truth, mask=truth.mask * 0)
+    again = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject()).mend(frame, TARGET, emptied)
+    assert torch.equal(again.completed.rgb, step.completed.rgb)
+    assert revealed("predicted-mask", truth) == (None, None)
 
 
 def test_the_hull_with_the_target_mask_lies_inside_of_it():

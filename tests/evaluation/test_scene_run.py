@@ -216,3 +216,14 @@ def test_classical_fills_get_white_views_and_keep_known_pixels(small_scenes):
     expected = Telea().step(white, nothing, State())[0].rgb
     torch.testing.assert_close(composite("white", done.rgb, done.opacity), expected)
     assert (expected[:, holes].mean() - Telea().step(view, nothing, State())[0].rgb[:, holes].mean()) > 0.02
+
+
+def test_a_predicted_mask_is_given_to_all_methods(small_scenes, scored):
+    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=1))
+    run = evaluate_scene(scene, ("telea", "nearest"), RunSettings(protocol="predicted-mask"))
+    assert [one.error for one in run.runs] == [None, None]
+    masks = [completed.view.target_mask for completed, *_ in scored]
+    assert torch.equal(masks[0], masks[1]) and 0 < float(masks[0].mean()) < 1
+    truth = scored[0][1].mask
+    overlap = ((masks[0] > 0.5) & truth).sum() / ((masks[0] > 0.5) | truth).sum()
+    assert float(overlap) > 0.8

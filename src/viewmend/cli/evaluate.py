@@ -42,9 +42,10 @@ class RunOptions:
     """Format of the captures (docs/formats.md); recognised by default."""
     inputs: str = "all"
     """Input cameras of a capture: all, or a number of evenly spaced ones; several values are separated by commas."""
-    protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
+    protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
     """What is known of the held-out camera: nothing ('strict'); its mask, which cuts and composites the view
-    ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
+    ('target-mask', as in the paper); its mask, which only carves the hull ('hull-with-target-mask'); or nothing, but
+    the alpha that 'views' predicts stands for its mask ('predicted-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None

@@ -51,9 +51,10 @@ class Options:
     """Names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
-    protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
+    protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
     """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and composites the view
-    ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
+    ('target-mask', as in the paper); its mask, which only carves the hull ('hull-with-target-mask'); or nothing, but
+    the alpha that 'views' predicts stands for its mask ('predicted-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea', 'reprojection',
@@ -92,7 +93,7 @@ def run(options: Options) -> int:
     from viewmend.data.source import prefetch
     from viewmend.mending import Mender, MendSummary
     from viewmend.models.base import RenderQuality
-    from viewmend.models.registry import error_model_for
+    from viewmend.models.registry import MASK_MODEL, error_model_for
     from viewmend.stream import StreamConfig
 
     render = options.view.config()
@@ -109,7 +110,9 @@ def run(options: Options) -> int:
     error_model = error_model_for(inpainter, options.device) if is_needed else None
     config = StreamConfig(geometry=options.geometry, render=render, memory_mb=None)
     quality = RenderQuality(top_k=options.top_k)
-    mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol)
+    by_prediction = options.protocol == "predicted-mask"
+    mask_model = load_named(MASK_MODEL, options.device, options.precision) if by_prediction else None
+    mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol, mask_model)
     summary = MendSummary(options.protocol)
     mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
@@ -139,7 +142,7 @@ def _check(options: Options) -> None:
     """Raise a ValueError for options that contradict each other or are out of range."""
     if (options.leave_out is None) == (options.path is None):
         raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
-    if options.leave_out is None and options.protocol != "strict":
+    if options.leave_out is None and options.protocol not in ("strict", "predicted-mask"):
         raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")

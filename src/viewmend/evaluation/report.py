@@ -21,7 +21,8 @@ RULES = (
     'The protocol says what else is known of the held-out camera. "strict": nothing. "target-mask": its mask, M_t for '
     "the paper's model, by which every completed view is cut and composited. "
     '"hull-with-target-mask": its mask carves the hull together with the others, as in RIFTCast\'s exporter, and is '
-    "not used otherwise.",
+    'not used otherwise. "predicted-mask": nothing, but the alpha that the model views predicts is M_t, by which every '
+    "completed view is cut and composited.",
     'Holes are the pixels of the geometry proxy that no source camera colours, not dilated: the error rule "holes". '
     "Scores use these pixels whatever a method is asked to inpaint. The truth is the held-out image on black or white, "
     "as the settings say. When scoring on white, classical fills and published networks also get the view on white. "

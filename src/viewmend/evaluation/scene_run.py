@@ -22,7 +22,8 @@ from viewmend.metrics.image_quality import SsimWindow
 from viewmend.models.base import Inpainter
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
-from viewmend.models.registry import error_model_for, make_method
+from viewmend.models.registry import MASK_MODEL, error_model_for, make_method
+from viewmend.predicted_mask import MaskPredictor
 from viewmend.scenes.held_out import LeaveOneOutScene, Protocol, revealed
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
@@ -109,7 +110,7 @@ def evaluate_scene(
     streams = [_MethodStream(name, settings, scorers, loaded) for name in methods]
     try:
         with torch.no_grad():
-            for frame in _frames(scene, settings):
+            for frame in _frames(scene, settings, loaded):
                 if frame.scored:
                     videos.add(frame.truth.rgb, frame.view.holes)
                 if frame.largest:
@@ -125,7 +126,7 @@ def evaluate_scene(
     return SceneRun(scene.name, tuple(stream.result() for stream in streams), images, videos.features())
 
 
-def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
+def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, Inpainter]) -> Iterator[_Frame]:
     most, last = -1, None
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
     depth_model = error_model_for(Unfilled(), settings.device) if config.geometry == "fused" else None
@@ -134,6 +135,11 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
         target_mask, own = revealed(settings.protocol, frame.truth)
         carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)
+        if settings.protocol == "predicted-mask":
+            if MASK_MODEL not in loaded:
+                loaded[MASK_MODEL] = make_method(MASK_MODEL, settings.device, settings.precision)
+            predictor = MaskPredictor(loaded[MASK_MODEL], settings.stream, frame.bounds)
+            target_mask = predictor.predict(cached, frame.truth.cameras)
         view = stream.render(frame.truth.cameras, target_mask=target_mask)
         holes, scored = int(view.holes.sum()), frame.inputs.time >= scene.scored_from
         origins = None if frame.seen is None else frame.seen.origins(view.source_views)

@@ -22,6 +22,8 @@ REFERENCE = "telea"
 """Tables show the difference of every method from this one."""
 ERROR_MODEL = "views"
 """The shipped model that predicts errors for inpainters that do not."""
+MASK_MODEL = "views"
+"""The shipped model whose alpha stands for a mask M_t that is not known."""
 PRIVILEGED = ("rgvi",)
 """Methods that use the ground truth; their table rows say so."""
 

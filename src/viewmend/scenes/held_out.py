@@ -16,8 +16,9 @@ from viewmend.types import MultiViewFrame, Silhouettes
 
 Split = Literal["training", "validation", "test"]
 
-Protocol = Literal["strict", "target-mask", "hull-with-target-mask"]
-"""What is known of the held-out camera: nothing; its mask, as M_t of the view; or its mask, which carves the hull."""
+Protocol = Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"]
+"""What is known of the held-out camera: nothing; nothing, but M_t of the view is predicted (`MaskPredictor`); its mask,
+as M_t; or its mask, which carves the hull."""
 
 PROCEDURAL_SEEDS: Mapping[Split, range] = {
     "training": range(9000),
@@ -48,7 +49,7 @@ def revealed(
     protocol: Protocol, truth: MultiViewFrame | None
 ) -> tuple[Float[Tensor, "height width"] | None, Silhouettes | None]:
     """What a protocol reveals of the held-out camera (one view): M_t, and a silhouette that carves the hull."""
-    if protocol == "strict" or truth is None:
+    if protocol in ("strict", "predicted-mask") or truth is None:
         return None, None
     assert truth.mask is not None, "held-out cameras have masks"
     if protocol == "target-mask":
