@@ -12,6 +12,7 @@ from viewmend.models.base import Inpainter, RenderQuality, State
 from viewmend.models.compositing import Background
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.utils.timing import exact_times
 
 SLOW_MS = 10_000.0
 """A first step that takes longer is not repeated for its timing: compilation is a small part of it."""
@@ -53,6 +54,7 @@ class ViewSequence:
         self._quality = quality
         self._warm_up: Stream | None = None
 
+    @exact_times()
     def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
         """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
@@ -66,6 +68,7 @@ class ViewSequence:
                 stream.add_frame(given, carving=carving)
         return own.cached_frame(given.time)
 
+    @exact_times()
     def view(
         self,
         target: Cameras,

@@ -6,7 +6,7 @@ view operations (which cost the CPU time only), waits for the device, and copies
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -154,9 +154,8 @@ def _count_wait(name: str) -> None:
 
 @contextmanager
 def other_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
-    """Within, tensors can be moved to the device, and made there; `COUNTS` counts. Autocast is the CPU's."""
+    """Within, tensors can be moved to the device, and made there; `COUNTS` counts. There is no autocast."""
     make = torch.tensor
-    autocast = torch.autocast
 
     def tensor(data, *, device=None, **options):
         return make(data, **options) if device is None else make(data, **options).to(device)
@@ -167,8 +166,8 @@ def other_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     # These would make their tensor without an operator, and know no such device.
     monkeypatch.setattr(torch, "tensor", tensor)
     monkeypatch.setattr(Tensor, "new_tensor", new_tensor)
-    # The values are computed on the CPU, where its autocast applies to them.
-    monkeypatch.setattr(torch, "autocast", lambda _, *args, **options: autocast("cpu", *args, **options))
+    # Autocast knows no such device.
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     COUNTS.reset()
     with _Operators():
         yield DEVICE

@@ -1,5 +1,6 @@
 """Drawing a triangle mesh into cameras: depth, triangle ids, and interpolated attributes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, pixel_centers
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.threads import light_operations, parallel_for
 
@@ -82,13 +83,19 @@ def interpolate(
     image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
     if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
         return _interpolate_cpu(attributes, mesh, cameras, raster, image)
-    where = view, row, column = (raster.triangle >= 0).nonzero(as_tuple=True)
-    corners = mesh.faces[raster.triangle[where].long()].long()
-    edges, _ = edge_functions(homogeneous(mesh.vertices, cameras)[view[:, None], corners])
-    values = edges[..., 0] * (column + 0.5)[:, None] + edges[..., 1] * (row + 0.5)[:, None] + edges[..., 2]
-    weights = (values / values.sum(-1, keepdim=True)).to(mesh.vertices)
-    image[where] = (attributes[corners] * weights[..., None].to(attributes)).sum(1)
-    return image
+    if not len(mesh.faces):
+        return image
+    # all pixels, those without a surface with any triangle: to find the others would wait for the device
+    covered = raster.triangle >= 0
+    corners = mesh.faces[raster.triangle.clamp(min=0).long()].long()
+    view = torch.arange(len(cameras), device=image.device)[:, None, None, None]
+    edges, _ = edge_functions(homogeneous(mesh.vertices, cameras)[view, corners])
+    u, v = pixel_centers(image.shape[2], image.shape[1], image.device).double()[..., None, :].unbind(-1)
+    values = edges[..., 0] * u + edges[..., 1] * v + edges[..., 2]
+    total = torch.where(covered, values.sum(-1), 1.0)[..., None]
+    weights = (values / total).to(mesh.vertices)
+    colour = (attributes[corners] * weights[..., None].to(attributes)).sum(-2)
+    return torch.where(covered[..., None], colour, 0.0)
 
 
 def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
@@ -129,34 +136,56 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
     """
     width, height = cameras.max_size_px
+    device = mesh.vertices.device
     corners = homogeneous(mesh.vertices, cameras)[:, mesh.faces.long()]
     edges, determinant = edge_functions(corners)
     low, high = _pixel_boxes(corners, cameras.size_px)
     keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
-    view, face = keep.nonzero(as_tuple=True)
-    edges, determinant, low, high = edges[keep], determinant[keep], low[keep], high[keep]
+
+    # every triangle of every view has a box of pixels, of which the device tells only the total number at first
+    view = torch.arange(len(cameras), device=device).repeat_interleave(len(mesh.faces), output_size=keep.numel())
+    face = torch.arange(len(mesh.faces), device=device).repeat(len(cameras))
+    extent = torch.where(keep[..., None], high - low + 1, 0).flatten(0, 1)
+    low = low.flatten(0, 1)
+    edges = edges.flatten(0, 1)
+    determinant = determinant.flatten()
+    ends = extent.prod(-1).cumsum(0)
 
     # The key orders by 1/z, then by the lower id: positive floats order like their bits.
-    keys = torch.full((len(cameras) * height * width,), -1, dtype=torch.long, device=mesh.vertices.device)
-    extent = high - low + 1
-    ends = extent.prod(-1).cumsum(0)
-    first = 0
-    while first < len(ends):
-        begin = int(ends[first - 1]) if first else 0
-        last = max(first + 1, int(torch.searchsorted(ends, begin + CANDIDATES, right=True)))
-        part = slice(first, last)
-        owner, uv = _candidate_pixels(low[part], extent[part])
+    keys = torch.full((len(cameras) * height * width,), -1, dtype=torch.long, device=device)
+    for part, pixels in _portions(ends):
+        owner, uv = _candidate_pixels(low[part], extent[part], pixels)
         inverse = _inverse_depth(edges[part][owner], determinant[part][owner], uv)
-        hit = inverse > 0
-        owner, uv = owner[hit] + first, uv[hit]
-        key = (inverse[hit].view(torch.int32).long() << 32) | (0x7FFFFFFF - face[owner])
+        owner = owner + part.start
+        key = (inverse.view(torch.int32).long() << 32) | (0x7FFFFFFF - face[owner])
+        key = torch.where(inverse > 0, key, -1)
         keys.scatter_reduce_(0, (view[owner] * height + uv[:, 1]) * width + uv[:, 0], key, "amax")
-        first = last
 
     keys = keys.view(len(cameras), height, width)
     triangle = torch.where(keys >= 0, 0x7FFFFFFF - (keys & 0x7FFFFFFF), -1).int()
     inverse = (keys >> 32).int().view(torch.float32)
     return Raster(torch.where(keys >= 0, 1 / inverse, 0.0), triangle)
+
+
+def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
+    """Boxes whose pixels are drawn at once, at most about `CANDIDATES`, and how many pixels they have.
+
+    `ends` counts the pixels up to the end of each box. One portion, if that is enough, waits for the device only once.
+    """
+    total = int(ends[-1]) if len(ends) else 0
+    if total <= CANDIDATES:
+        if total:
+            yield slice(0, len(ends)), total
+        return
+    on_host = ends.cpu()
+    first = 0
+    while first < len(ends):
+        begin = int(on_host[first - 1]) if first else 0
+        last = max(first + 1, int(torch.searchsorted(on_host, begin + CANDIDATES, right=True)))
+        pixels = int(on_host[last - 1]) - begin
+        if pixels:
+            yield slice(first, last), pixels
+        first = last
 
 
 def _pixel_boxes(
@@ -172,11 +201,11 @@ def _pixel_boxes(
 
 
 def _candidate_pixels(
-    low: Int[Tensor, "face 2"], extent: Int[Tensor, "face 2"]
+    low: Int[Tensor, "face 2"], extent: Int[Tensor, "face 2"], pixels: int
 ) -> tuple[Int[Tensor, "candidate"], Int[Tensor, "candidate 2"]]:
-    """Every pixel of every box, with the position of its box."""
+    """Every pixel of every box, with the position of its box; there are `pixels` of them."""
     area = extent.prod(-1)
-    owner = torch.repeat_interleave(torch.arange(len(area), device=area.device), area)
+    owner = torch.repeat_interleave(torch.arange(len(area), device=area.device), area, output_size=pixels)
     within = torch.arange(len(owner), device=area.device) - (area.cumsum(0) - area)[owner]
     columns = extent[owner, 0]
     return owner, low[owner] + torch.stack([within % columns, within // columns], -1)

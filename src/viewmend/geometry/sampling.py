@@ -1,9 +1,8 @@
 """Images looked up at pixel positions. Pixel centres are at half-integers, (0.5, 0.5) at the top left."""
 
-from collections.abc import Iterator
-from itertools import product
 from typing import Literal, NamedTuple
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
@@ -11,16 +10,16 @@ from torch.nn import functional as F
 from viewmend.geometry.cameras import Cameras
 
 
-class BilinearTap(NamedTuple):
-    """One of the four pixels that a bilinear sample is made of, for many positions."""
+class BilinearTaps(NamedTuple):
+    """The four pixels that bilinear samples at many positions are made of."""
 
-    row: Int[Tensor, "*point"]
+    row: Int[Tensor, "tap=4 view point"]
     """Clamped to the image."""
-    column: Int[Tensor, "*point"]
+    column: Int[Tensor, "tap=4 view point"]
     """Clamped to the image."""
-    weight: Float[Tensor, "*point"]
+    weight: Float[Tensor, "tap=4 view point"]
     """The four weights sum to 1, also beyond the border of the image."""
-    inside: Bool[Tensor, "*point"]
+    inside: Bool[Tensor, "tap=4 view point"]
     """Whether the image has this pixel; where not, `row` and `column` name the nearest one at its border."""
 
 
@@ -31,20 +30,22 @@ def in_view(
     return (z_m > 0) & (uv_px >= 0).all(-1) & (uv_px < cameras.size_px[:, None]).all(-1)
 
 
-def bilinear_taps(uv_px: Float[Tensor, "*point 2"], width: int, height: int) -> Iterator[BilinearTap]:
-    """The four pixels around each position, row by row, for callers to whom not every pixel counts.
+def bilinear_taps(uv_px: Float[Tensor, "view point 2"], cameras: Cameras) -> BilinearTaps:
+    """The four pixels around each position in its camera's image, stacked in front, row by row.
 
     Only four pixels a position are read, so an image of bytes need not be converted whole.
     """
-    uv_px = _clamped(uv_px, width, height) - 0.5
-    first = uv_px.floor()
-    right, below = (uv_px - first).unbind(-1)
-    left, top = first.long().unbind(-1)
-    for down, across in product((0, 1), (0, 1)):
-        row, column = top + down, left + across
-        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        weight = (right if across else 1 - right) * (below if down else 1 - below)
-        yield BilinearTap(row.clamp(0, height - 1), column.clamp(0, width - 1), weight, inside)
+    width, height = cameras.max_size_px
+    size = cameras.size_px[:, None]
+    clamped = _clamped(uv_px, width, height) - 0.5
+    first = clamped.floor()
+    share = clamped - first
+    corner = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], device=uv_px.device)[:, None, None]
+    place = first.long() + corner
+    weight = torch.where(corner > 0, share, 1 - share).prod(-1)
+    inside = ((place >= 0) & (place < size)).all(-1)
+    column, row = place.clamp(min=0).minimum(size - 1).unbind(-1)
+    return BilinearTaps(row, column, weight, inside)
 
 
 def sample_bilinear(

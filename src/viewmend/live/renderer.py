@@ -30,7 +30,7 @@ from viewmend.rendering.proxy_views import hull_points, shaded_hull, vertex_colo
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.cancellation import CancelledError
-from viewmend.utils.timing import StageTimes
+from viewmend.utils.timing import StageTimes, exact_times
 
 WARM_UP_PX = 64
 MAX_VARIANTS, VARIANT_MB = 3, 200.0
@@ -176,6 +176,7 @@ class Renderer:
         self._rig, self._stream, self.home = rig, stream, home
         return True
 
+    @exact_times()
     def render(self, request: RenderRequest, viewer: State | None) -> RenderResult:
         """Render the views of all eyes, from one viewer's state.
 

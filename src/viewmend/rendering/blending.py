@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.geometry.sampling import bilinear_taps, in_view
 from viewmend.geometry.threads import parallel_for
 from viewmend.types import ContextViews
@@ -132,33 +132,22 @@ def blend_torch(
     config: BlendConfig,
 ) -> Blend:
     """`blend` in torch, for any device."""
-    # the surface's points in the novel view
-    row, column = (depth > 0).nonzero(as_tuple=True)
-    pixels = torch.stack([column, row], -1) + 0.5
-    points = unproject(pixels[None].to(depth), depth[row, column][None], camera)[0]
-    normal = normalize(normals[row, column], dim=-1)
+    # the points of all pixels, those without a surface at depth 1: to find the others would wait for the device
+    uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device).view(1, -1, 2)
+    covered = depth.flatten() > 0
+    points = unproject(uv_px, torch.where(covered, depth.flatten(), 1.0)[None], camera)[0]
+    normal = normalize(normals.flatten(0, 1), dim=-1)
     to_viewer = normalize(camera.centers[0] - points, dim=-1)
 
     # each camera's colour and weight there
-    views = range(len(sources.frame.cameras))
-    samples = [_sample(points, normal, to_viewer, sources, view, bias_m, config) for view in views]
-    weight = torch.stack([own_weight for own_weight, _ in samples])
-    colour = torch.stack([own_colour for _, own_colour in samples])
+    weight, colour = _sample(points, normal, to_viewer, sources, bias_m, config)
+    weight = weight * covered
 
     # their weighted mean and variance
     total = weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
     mean = (weight[:, None] * colour).sum(0) / total
     variance = (weight * (colour - mean).square().mean(1)).sum(0) / total
-
-    blended = Blend(
-        rgb=depth.new_zeros(3, *depth.shape),
-        weights=depth.new_zeros(len(views), *depth.shape),
-        disagreement=torch.zeros_like(depth),
-    )
-    blended.rgb[:, row, column] = mean
-    blended.weights[:, row, column] = weight
-    blended.disagreement[row, column] = variance.sqrt()
-    return blended
+    return Blend(mean.view(3, *depth.shape), weight.view(-1, *depth.shape), variance.sqrt().view(depth.shape))
 
 
 def _sample(
@@ -166,27 +155,31 @@ def _sample(
     normal: Float[Tensor, "point 3"],
     to_viewer: Float[Tensor, "point 3"],
     sources: ContextViews,
-    view: int,
     bias_m: float,
     config: BlendConfig,
-) -> tuple[Float[Tensor, "point"], Float[Tensor, "3 point"]]:
-    """Weight and colour of one camera at each surface point."""
-    frame, camera = sources.frame, sources.frame.cameras[view]
-    uv, z = (values[0] for values in project(points, camera))
-    width, height = camera.size_px[0].tolist()
-    to_camera = normalize(camera.centers[0] - points, dim=-1)
+) -> tuple[Float[Tensor, "view point"], Float[Tensor, "view 3 point"]]:
+    """Weight and colour of each camera at each surface point."""
+    frame = sources.frame
+    rig = frame.cameras
+    uv, z = project(points, rig)
+    to_camera = normalize(rig.centers[:, None] - points, dim=-1)
     facing = (normal * to_camera).sum(-1).clamp(0, 1)
     agreeing = (to_viewer * to_camera).sum(-1).clamp(0, 1)
 
     # Change of depth of a surface at this angle from one pixel of the camera to the next.
-    per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
-    usable, colour = torch.zeros_like(z), z.new_zeros(3, len(z))
-    for row, column, weight, _ in bilinear_taps(uv, width, height):
-        depth = sources.depth[view, row, column]
-        weight = weight * ((depth == 0) | (z - depth <= bias_m + config.slope_px * per_pixel))
-        if frame.mask is not None:
-            weight = weight * (frame.mask[view, row, column] / 255)
-        usable = usable + weight
-        colour = colour + weight * frame.rgb[view, :, row, column]
-    weight = in_view(uv[None], z[None], camera)[0] * usable * facing**config.normal_power * agreeing**config.view_power
-    return weight, colour / (255 * usable).clamp(min=1e-6)
+    focal = rig.K[:, 0, 0, None]
+    per_pixel = z / focal * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
+    farthest = bias_m + config.slope_px * per_pixel
+
+    # the four pixels around each sample, of which those count that are foreground and visible
+    taps = bilinear_taps(uv, rig)
+    view = torch.arange(len(rig), device=z.device)[:, None]
+    depth = sources.depth[view, taps.row, taps.column]
+    share = taps.weight * ((depth == 0) | (z - depth <= farthest))
+    if frame.mask is not None:
+        share = share * (frame.mask[view, taps.row, taps.column] / 255)
+    rgb = frame.rgb.movedim(1, -1)[view, taps.row, taps.column]
+    colour = (share[..., None] * rgb).sum(0)
+    usable = share.sum(0)
+    weight = in_view(uv, z, rig) * usable * facing**config.normal_power * agreeing**config.view_power
+    return weight, (colour / (255 * usable).clamp(min=1e-6)[..., None]).movedim(-1, 1)

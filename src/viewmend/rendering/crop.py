@@ -92,11 +92,11 @@ def mesh_crop(
     if not len(vertices):
         return Crop.all_of(camera)
     uv, z = project(vertices, camera)
-    if bool((z < NEAR_M).any()):
+    found = torch.cat([z.amin(1), uv[0].amin(0), uv[0].amax(0)])  # a device is read only once
+    nearest_m, first_u, first_v, last_u, last_v = found.tolist()
+    if nearest_m < NEAR_M:
         return Crop.all_of(camera)
     width, height = camera.max_size_px
-    first_u, first_v = uv[0].amin(0).tolist()
-    last_u, last_v = uv[0].amax(0).tolist()
     left, right = _side(first_u - margin_px, last_u + margin_px, width, grid_px)
     top, bottom = _side(first_v - margin_px, last_v + margin_px, height, grid_px)
     return Crop(left, top, right, bottom)

@@ -82,9 +82,7 @@ def render_view(
     source_depth = source_depth or (lambda names: proxy.depth(frame.cameras.select(names)))
     raster = rasterize(proxy.mesh, target)
     normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
-    center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
-    size_m = float(proxy.bounds.size_m.norm())
-    surface = _Surface(raster.depth[0], normals, center, size_m)
+    surface = _Surface(raster.depth[0], normals, proxy.center, proxy.bounds.diagonal_m)
     return _colour(frame, target, surface, config, exclude, source_depth)
 
 
@@ -111,7 +109,7 @@ def render_depth(
     if not len(visible):
         visible = points.new_zeros(1, 3)
     size_m = float((visible.amax(0) - visible.amin(0)).norm())
-    surface = _Surface(depth, normals, visible.mean(0), size_m)
+    surface = _Surface(depth, normals, visible.mean(0).cpu(), size_m)
     return _colour(frame, target, surface, config, (), source_depth)
 
 
@@ -121,7 +119,7 @@ class _Surface(NamedTuple):
     depth: Float[Tensor, "height width"]
     normals: Float[Tensor, "height width 3"]
     center: Float[Tensor, "3"]
-    """Of the whole subject."""
+    """The middle of the whole subject, on the CPU."""
     size_m: float
     """Diagonal of the subject's box."""
 
@@ -182,10 +180,12 @@ def select_closest(
     'direction' it is the angle between the optical axes, for cameras that look at different places. Returns fewer than
     k names if there are fewer cameras.
     """
+    target = target.on_host
+    cameras = cameras.on_host
     if selection == "direction":
         distance = -(cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2])
     else:
-        distance = angles_to(target, cameras, subject_center)
+        distance = angles_to(target, cameras, subject_center.cpu())
     distances = distance.tolist()
     nearest = sorted(range(len(cameras)), key=lambda view: distances[view])
     return tuple(cameras.names[view] for view in nearest[:k])

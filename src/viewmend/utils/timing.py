@@ -1,17 +1,22 @@
 """Timing of the stages of a view."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 
 Times = TypeVar("Times", bound="StageTimes")
+_exact: ContextVar[bool] = ContextVar("exact", default=False)
+"""Whether the device is waited for before a time is taken (`exact_times`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageTimes:
-    """Milliseconds of each stage of one view, including the work on the device.
+    """Milliseconds of each stage of one view; on a GPU, within `exact_times` including the work there.
 
     Examples:
         >>> from viewmend import StageTimes
@@ -38,9 +43,22 @@ class StageTimes:
         return sum(vars(self).values())
 
 
+@contextmanager
+def exact_times() -> Iterator[None]:
+    """Wait for the device before each time is taken, so that a stage's time includes its work there.
+
+    Outside of it, a stage's time on a device ends when its work has been handed over, and nothing waits.
+    """
+    token = _exact.set(True)
+    try:
+        yield
+    finally:
+        _exact.reset(token)
+
+
 def now_s(device: torch.device) -> float:
-    """Current time in seconds, after synchronising the device."""
-    if device.type == "cuda":
+    """Current time in seconds, within `exact_times` after synchronising the device."""
+    if device.type == "cuda" and _exact.get():
         torch.cuda.synchronize(device)
     return time.perf_counter()
 

@@ -69,7 +69,7 @@ class Target:
     places: Int[Tensor, "patch 3"]
     tokens: Float[Tensor, "patch dim"]
     incomplete: Bool[Tensor, "patch"]
-    """Patches with any pixel of E > 0."""
+    """Patches with any pixel of E > 0; on the CPU, so that no device is read to find them."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,8 @@ class Batch:
     """The input of the transformer."""
 
     queries: Float[Tensor, "sample query dim"]
+    counts: list[int]
+    """How many queries of each sample are not padding."""
     at: TokenPositions
     keys_values: Float[Tensor, "block 2 sample key dim"]
     context_at: TokenPositions
@@ -95,7 +97,7 @@ def collate(
     queries, query_positions, keys, key_positions = [], [], [], []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
         uvs = F.pad(centers_px(target.places) / target.view.camera.size_px[0], (0, 1))  # s = 0 in the novel view
-        valid = torch.ones_like(target.incomplete)
+        valid = torch.ones(len(uvs), dtype=torch.bool, device=uvs.device)
         queries.append(target.tokens[target.incomplete])
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
         parts = [_carry(frame, frames, target.view, config) for frame in frames]
@@ -108,7 +110,8 @@ def collate(
     joined = [_join(parts, num_keys) for parts in keys]
     keys_values = torch.stack(joined, 2) if len(joined) > 1 else joined[0][:, :, None]  # one sample: no copy
     padded = torch.stack([_pad(q, num_queries) for q in queries])
-    return Batch(padded, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys))
+    counts = [len(own_queries) for own_queries in queries]
+    return Batch(padded, counts, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys))
 
 
 def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:

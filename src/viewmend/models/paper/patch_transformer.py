@@ -145,7 +145,7 @@ class PatchTransformer(Network):
         with self.autocast():
             tokens = self.tokeniser(stacks).split([len(stack.places) for stack in stacks])
         return [
-            Target(view, stack.places, own, any_in_patch(view.missing[None] > 0)[stack.kept])
+            Target(view, stack.places, own, any_in_patch(view.missing[None] > 0).cpu()[stack.kept_on_host])
             for view, stack, own in zip(views, stacks, tokens, strict=True)
         ]
 
@@ -159,8 +159,8 @@ class PatchTransformer(Network):
         """RGB of each target's incomplete patches: transformer and decoder (sections 6 and 7)."""
         with self.autocast():
             tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k)
-            decoded = self.decoder(tokens[batch.at.present])
-        return list(decoded.float().split(batch.at.present.sum(1).tolist()))
+            decoded = self.decoder(torch.cat([own[:count] for own, count in zip(tokens, batch.counts, strict=True)]))
+        return list(decoded.float().split(batch.counts))
 
     def _predict(self, target: Target, patches: Float[Tensor, "patch 3 28 28"] | None) -> Prediction:
         """The decoded patches merged, and the view completed (section 7); unchanged without patches."""

@@ -71,13 +71,15 @@ def merge(patches: Patches, places: Places, shape: tuple[int, int, int], step: i
     v = places[:, 1, None, None] * step + offsets[:, None]
     u = places[:, 2, None, None] * step + offsets
     inside = (v < height) & (u < width)
-    flat = ((places[:, 0, None, None] * height + v) * width + u)[inside]
+    pixels = views * height * width
+    # Pixels of patches beyond the image go to an extra place: to leave them out would wait for a device.
+    flat = torch.where(inside, (places[:, 0, None, None] * height + v) * width + u, pixels).flatten()
 
     ramp = torch.minimum(offsets + 0.5, size - (offsets + 0.5))  # falls from a patch's centre to its edges, above 0
     weights = (ramp[:, None] * ramp / (size / 2) ** 2).to(patches).expand(len(patches), -1, -1)
-    weighted = torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1)[inside]
-    total = weighted.new_zeros(views * height * width, channels + 1).index_add(0, flat, weighted)
-    total = total.unflatten(0, (views, height, width)).movedim(-1, 1)
+    weighted = torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1).reshape(-1, channels + 1)
+    sums = weighted.new_zeros(pixels + 1, channels + 1).index_add(0, flat, weighted)[:pixels]
+    total = sums.unflatten(0, (views, height, width)).movedim(-1, 1)
     weight = total[:, -1]
     return total[:, :-1] / weight.clamp_min(1e-6)[:, None], (weight > 0).to(patches.dtype)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,10 +34,15 @@ class EncoderInput:
     kept: Bool[Tensor, "view rows cols"]
     """Patches with any foreground; all others are discarded (section 4)."""
 
-    @property
+    @cached_property
+    def kept_on_host(self) -> Bool[Tensor, "view rows cols"]:
+        """`kept` on the CPU, where it decides what is cropped; a device is read once."""
+        return self.kept.cpu()
+
+    @cached_property
     def places(self) -> Int[Tensor, "patch 3"]:
         """View, row and column of each kept patch."""
-        return torch.nonzero(self.kept)
+        return torch.nonzero(self.kept_on_host).to(self.kept.device)
 
 
 def build_context_input(views: ContextViews, config: PaperConfig) -> EncoderInput:
@@ -45,8 +51,9 @@ def build_context_input(views: ContextViews, config: PaperConfig) -> EncoderInpu
     rgb = frame.rgb.float() / 255
     mask = (views.depth > 0).float() if frame.mask is None else frame.mask.float() / 255
     inside = torch.ones_like(mask)
-    for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
-        image[height:], image[:, width:] = 0, 0
+    for image, (width, height) in zip(inside, frame.cameras.sizes, strict=True):
+        image[height:] = 0
+        image[:, width:] = 0
     if not config.use_mask:  # neither matting nor pruning of patches
         return _stack_channels(rgb, mask, views.depth, inside > 0, config)
     rgb = rgb * mask[:, None]
@@ -87,8 +94,8 @@ def relative_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "
 
     It is independent of the rig's scale and of the target view, so features computed from it can be cached.
     """
-    surfaces = (image[image > 0] for image in depth)
-    reference = torch.stack([z.median() if len(z) else z.new_ones(()) for z in surfaces])
+    surface = torch.where(depth > 0, depth, torch.nan)
+    reference = surface.flatten(1).nanmedian(1).values.nan_to_num(1.0)
     return torch.where(depth > 0, 4 * (depth / reference[:, None, None] - 1), 0.0)
 
 
@@ -153,7 +160,7 @@ class Tokeniser(nn.Module):
         Only a crop around each image's kept patches is encoded, including the encoder's receptive radius. The result
         depends neither on the size of the crop nor on the other images of the batch.
         """
-        images = [pair for stack in stacks for pair in zip(stack.channels, stack.kept, strict=True)]
+        images = [pair for stack in stacks for pair in zip(stack.channels, stack.kept_on_host, strict=True)]
         # A batch pads all crops to the largest one, which is worthwhile on a GPU but not on a CPU.
         batches = [[pair] for pair in images] if images[0][0].device.type == "cpu" else [images]
         return self.linear(torch.cat([self._encode(batch) for batch in batches]).flatten(1))
@@ -167,9 +174,9 @@ class Tokeniser(nn.Module):
         windows, places = [], []
         for number, ((image, kept), ((row, col), _)) in enumerate(zip(images, crops, strict=True)):
             windows.append(crop(image, row * STEP_PX, col * STEP_PX, size))
-            kept_places = torch.nonzero(kept)
-            places.append(F.pad(kept_places - kept_places.new_tensor([row, col]), (1, 0), value=number))
-        return split(self.encoder(torch.stack(windows)), torch.cat(places), PATCH_CELLS, STEP_CELLS)
+            places.append(F.pad(torch.nonzero(kept) - torch.tensor([row, col]), (1, 0), value=number))
+        features = self.encoder(torch.stack(windows))
+        return split(features, torch.cat(places).to(features.device), PATCH_CELLS, STEP_CELLS)
 
 
 def find_crop(kept: Bool[Tensor, "rows cols"]) -> tuple[tuple[int, int], tuple[int, int]]:
