@@ -59,10 +59,11 @@ class HullConfig:
     min_views: int = 2
     """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
-    """Points seen by a smaller share of the cameras count as empty. Cameras whose image border cuts the subject off do
-    not count here, since they cannot see all of it."""
+    """Points seen by a smaller share of the cameras count as empty. If fewer cameras than that see the whole subject,
+    because the image border of the others cuts it off, it is enough that as many as these see a point."""
     least_fraction: float = 0.25
-    """Points seen by a smaller share of all cameras count as empty in any case, unless `min_fraction` is lower."""
+    """Points seen by a smaller share of the cameras count as empty, however many are cut off, if `min_fraction` is not
+    lower."""
 
 
 Box = tuple[slice, slice, slice]
@@ -210,8 +211,12 @@ def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_bloc
 
 def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:
     """How many of `views` cameras must see a point for it to count, `cut_off` of which see a part of the subject."""
-    share = max(config.min_fraction * (views - cut_off), min(config.min_fraction, config.least_fraction) * views)
-    return max(min(config.min_views, views), math.ceil(share))
+    usual = math.ceil(config.min_fraction * views)
+    whole = views - cut_off
+    if whole >= 2:
+        least = math.ceil(config.least_fraction * views)
+        usual = min(usual, max(whole, least))
+    return max(min(config.min_views, views), usual)
 
 
 def count_cut_off(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> int:
