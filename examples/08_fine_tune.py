@@ -1,7 +1,7 @@
 """Fine-tune the default model on a capture and compare: `python examples/08_fine_tune.py CAPTURE [OUT]`.
 
-`viewmend train finetune` keeps one camera and the last frames for validation. This program leaves out another camera,
-which neither model has seen, and scores both on it.
+`viewmend train finetune` holds back one camera and the last frames, by which it chooses the best weights. This program
+scores both models on the last frame of that camera, which training has not seen.
 """
 
 import math
@@ -28,18 +28,8 @@ def psnr_db(inpainter: Inpainter, capture: Path, held: str) -> float:
 def main(capture: Path, out: Path, *options: str) -> tuple[float, float]:
     """Train for `--minutes` (30 by default) and return PSNR before and after."""
     held = open_capture(capture).cameras.names[0]
-    command = [
-        sys.executable,
-        "-m",
-        "viewmend",
-        "train",
-        "finetune",
-        str(capture),
-        "--from",
-        "views",
-        "--out",
-        str(out),
-    ]
+    command = [sys.executable, "-m", "viewmend", "train", "finetune", str(capture), "--from", "views"]
+    command += ["--hold-out", held, "--out", str(out)]
     subprocess.run([*command, *(options or ("--minutes", "30"))], check=True)
     return psnr_db(load_inpainter("views"), capture, held), psnr_db(load_inpainter(out), capture, held)
 
