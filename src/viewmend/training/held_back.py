@@ -172,7 +172,8 @@ def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[He
         chosen = [own.camera] if own.camera else []
         shown = min(MAX_TABLE, len(others))
         chosen += [others[len(others) * n // shown] for n in range(shown)]
-        wanted = [(name, late[len(late) // 2]) for name in dict.fromkeys(chosen)]
+        time = _time_with_subject(capture, late)
+        wanted = [(name, time) for name in dict.fromkeys(chosen)]
     elif own.camera is None:
         wanted = [(names[n % len(names)], late[len(late) * n // MAX_VIEWS]) for n in range(MAX_VIEWS)]
     else:
@@ -187,6 +188,19 @@ def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[He
         seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
         yield HeldBackView(camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth)
+
+
+def _time_with_subject(capture: NativeCapture, late: range) -> int:
+    """The frame nearest to the middle of those held back that has a subject, or else the last one before them.
+
+    Without any, the middle one.
+    """
+    middle = late[len(late) // 2]
+    held = sorted(late, key=lambda time: abs(time - middle))
+    for time in (*held, *reversed(range(late.start))):
+        if capture.read(time).has_subject:
+            return time
+    return middle
 
 
 @dataclass
