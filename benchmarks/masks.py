@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ import cv2
 from corruptions_lib import corrupt, middle
 from measure import write
 
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSubset

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from viewmend.utils.openmp import let_idle_threads_sleep
 
 if TYPE_CHECKING:
+    from viewmend.data.capture_folder import open_capture
     from viewmend.data.errors import CaptureError
     from viewmend.data.images import write_image
-    from viewmend.data.native_capture import open_capture
     from viewmend.data.native_writer import write_capture
     from viewmend.data.prepare import prepare
     from viewmend.frame_cache import CachedFrame, DepthProvider
@@ -83,7 +83,7 @@ __all__ = [
 _NAMES = {
     "data.errors": ("CaptureError",),
     "data.images": ("write_image",),
-    "data.native_capture": ("open_capture",),
+    "data.capture_folder": ("open_capture",),
     "data.native_writer": ("write_capture",),
     "data.prepare": ("prepare",),
     "frame_cache": ("CachedFrame", "DepthProvider"),

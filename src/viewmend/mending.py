@@ -127,7 +127,8 @@ class MendSummary:
     """Collects scores and times of a run, without images."""
 
     def __init__(self, protocol: Protocol = "strict") -> None:
-        self.protocol, self.frames = protocol, 0
+        self.protocol = protocol
+        self.frames = 0
         self.background: Background = "black"
         self.hull_iou: dict[str, list[float]] = {}
         """IoU of each camera, frame by frame."""
@@ -140,7 +141,8 @@ class MendSummary:
     def add(self, step: MendStep) -> None:
         """Add one view."""
         view = step.completed.view
-        self.frames, self.background = self.frames + 1, step.background
+        self.frames = self.frames + 1
+        self.background = step.background
         self._hull_px += int((view.mask > 0.5).sum())
         self._hole_px += int(view.holes.sum())
         self._completed_px += int(((view.mask > 0.5) & view.refine_mask).sum())

@@ -94,7 +94,8 @@ class ViewSequence:
             if stream is self._warm_up and made.times.inpainting >= SLOW_MS:
                 self.stream = stream
                 break
-        self._warm_up, self.state = None, made.viewer
+        self._warm_up = None
+        self.state = made.viewer
         return made
 
     def skip(self, target: Cameras, time: int, target_mask: Float[Tensor, "height width"] | None = None) -> None:

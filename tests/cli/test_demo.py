@@ -6,7 +6,7 @@ import cv2
 import torch
 
 from viewmend.cli import main
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.mending import Mender
 from viewmend.utils.contact_sheet import GAP_PX, LABEL_PX
 

@@ -9,7 +9,7 @@ from reference.capture_folder import remove_masks
 
 from viewmend.cli import main
 from viewmend.cli.checks import chosen_times
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.prepare import adjustments
 
 AS_IT_IS = ("--no-align", "--no-match-colours")

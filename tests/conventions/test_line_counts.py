@@ -7,9 +7,9 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 674,
+    "parallel": 140,
     "walruses": 90,
-    "prepositions": 104,
+    "prepositions": 100,
     "late_constants": 51,
     "statements": 4,
     "locals": 33,

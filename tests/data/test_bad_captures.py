@@ -6,8 +6,8 @@ from reference.foreign_formats import write_easymocap
 from reference.foreign_studios import write_take
 
 from viewmend.cli import main
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_capture import open_capture
 
 
 def camera(**values):

@@ -12,12 +12,12 @@ from reference.ball import BallCapture, photograph, ring
 from reference.capture_folder import description_of, edit_description
 
 from viewmend.cli import main
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.checks import leave_one_out, synchronisation
 from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
-from viewmend.data.checks.leave_one_out import LeaveOneOut, find_outlier_by_hull, find_outlier_by_outlines
+from viewmend.data.checks.leave_one_out import OthersHulls, find_outlier_by_hull, find_outlier_by_outlines
 from viewmend.data.checks.synchronisation import check_image_mask_sync, describe_delay, find_desynchronised_cameras
-from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.studio.stage import Studio, StudioConfig
@@ -346,7 +346,7 @@ def ball():
 def test_rigs_of_few_cameras_keep_one_that_is_a_little_wrong(monkeypatch, ball, cameras, own, left_out):
     removed, outside = torch.zeros(2, cameras)
     removed[1] = own
-    found = LeaveOneOut(torch.zeros(cameras, 1, 1, dtype=torch.bool), removed, outside)
+    found = OthersHulls(torch.zeros(cameras, 1, 1, dtype=torch.bool), removed, outside)
     monkeypatch.setattr(leave_one_out, "leave_one_out", lambda frame, bounds, hull: found)
     (issue,) = find_outlier_by_hull(ball.select(ball.cameras.names[:cameras]), None)
     assert issue.camera == left_out

@@ -25,10 +25,10 @@ from reference.random_rigs import (
     write_images,
 )
 
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.containers import names_in, read_bytes
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.native_capture import open_capture
 from viewmend.scenes.capture_scenes import capture_set
 
 META = """{ // comments are allowed

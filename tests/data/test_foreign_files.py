@@ -12,10 +12,10 @@ from reference.foreign_formats import write_colmap, write_easymocap, write_trans
 from reference.foreign_rigs import write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.formats.files import frame_pattern
-from viewmend.data.native_capture import open_capture
 
 # What the values of masks mean.
 

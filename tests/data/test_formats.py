@@ -26,11 +26,11 @@ from reference.random_rigs import (
 )
 
 from viewmend.cli import main
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.formats.files import Footage, match_names
 from viewmend.data.formats.opencv import MAX_BYTES, read_storage
-from viewmend.data.native_capture import open_capture
 from viewmend.data.videos import video_properties
 from viewmend.scenes.capture_scenes import capture_set
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureWrapper
 

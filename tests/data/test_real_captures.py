@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.source import prefetch
 from viewmend.geometry.proxy import reconstruct
 

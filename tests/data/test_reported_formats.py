@@ -16,10 +16,10 @@ from reference.foreign_images import write_agisoft
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.checks.leave_one_out import find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import reconstruct

@@ -8,7 +8,7 @@ from reference.ball import BallCapture, photograph, ring
 from reference.films import write_film, write_film_capture
 
 from viewmend.cli import main
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.video_clock import ABSENT, Track, match_tracks
 

@@ -19,7 +19,7 @@ from reference.ball import BallCapture, ring
 import viewmend
 from viewmend import cli
 from viewmend.data import formats
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 from viewmend.live.push import PushSource
 from viewmend.models.base import Inpainter
 from viewmend.models.checkpoint import save_inpainter

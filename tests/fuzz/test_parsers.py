@@ -22,8 +22,8 @@ from reference.random_rigs import named, random_rig
 from studio.tiny_performer import write_character, write_motion
 
 from viewmend.data.camera_path import read_camera_path
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.images import read_mask, read_rgb
-from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.live.protocol import Limits, Look, parse, unpack
 from viewmend.live.push import RigMessage, read_message

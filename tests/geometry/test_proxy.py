@@ -63,9 +63,9 @@ def test_moving_to_a_device_keeps_everything():
 
 def test_real_captures_overlap_their_masks(shared):
     """Held-out silhouettes of a person, in decimetres, upside down: the default settings."""
-    from viewmend.data.native_capture import NativeCapture
+    from viewmend.data.capture_folder import CaptureFolder
 
-    frame = NativeCapture(shared / "captures" / "wd2").read(0)
+    frame = CaptureFolder(shared / "captures" / "wd2").read(0)
     assert frame.mask is not None
     held = frame.cameras.names[8]
     others = frame.without([held])

@@ -12,7 +12,7 @@ from reference.capture_folder import edit_description
 from reference.filmed_board import photograph, waved
 
 from viewmend.cli import main
-from viewmend.data.native_capture import open_capture, pinhole_cameras
+from viewmend.data.capture_folder import open_capture, pinhole_cameras
 from viewmend.data.native_format import read_calibration
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureSubset

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from viewmend.cli import main
-from viewmend.data.native_capture import open_capture
+from viewmend.data.capture_folder import open_capture
 
 SIZE = (160, 128)
 """Four times that of the folder `plain`."""

@@ -15,7 +15,7 @@ from viewmend.models.checkpoint import load_network
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import composite
 from viewmend.models.paper.patch_transformer import PatchTransformer
-from viewmend.training.loop import Clock, Run, averaging, join_processes, train
+from viewmend.training.loop import Run, RunClock, averaging, join_processes, train
 from viewmend.training.paper import PaperObjective
 from viewmend.training.run_files import FILE, RunError
 from viewmend.training.samples import true_image
@@ -35,8 +35,8 @@ def with_options(config, **changes):
 def every_two(monkeypatch):
     """Checkpoints are due at every second step."""
     calls = []
-    monkeypatch.setattr(Clock, "checkpoint_due", lambda self: calls.append(0) or len(calls) % 2 == 0)
-    monkeypatch.setattr(Clock, "saved", lambda self: calls.clear())
+    monkeypatch.setattr(RunClock, "checkpoint_due", lambda self: calls.append(0) or len(calls) % 2 == 0)
+    monkeypatch.setattr(RunClock, "saved", lambda self: calls.clear())
 
 
 def test_a_short_run_trains_the_model_and_writes_a_log_and_a_card(tiny, tmp_path):
@@ -86,7 +86,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(adversarial, tiny, tmp_path, 
 def test_checkpoints_are_due_by_time(tiny, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("viewmend.training.loop.time.monotonic", lambda: now[0])
-    clock = Clock(replace(tiny, checkpoint_minutes=2.0), 0, 0.0)
+    clock = RunClock(replace(tiny, checkpoint_minutes=2.0), 0, 0.0)
     due = []
     for seconds in (0, 119, 1):
         now[0] += seconds
@@ -94,7 +94,7 @@ def test_checkpoints_are_due_by_time(tiny, monkeypatch):
     clock.saved()
     assert due == [False, False, True] and not clock.checkpoint_due()
     now[0] += 60 * 3
-    assert Clock(replace(tiny, minutes=10.0), 0, 30.0).progress(0) == pytest.approx(0.05)
+    assert RunClock(replace(tiny, minutes=10.0), 0, 30.0).progress(0) == pytest.approx(0.05)
 
 
 def test_a_run_that_is_stopped_loses_no_step(tiny, tmp_path):

@@ -83,7 +83,8 @@ def _dispatch(arguments: list[str]) -> int:
 
     arguments = arguments[len(command.name.split()) :]
     module = importlib.import_module(command.module)
-    prog, flags = f"viewmend {command.name}", (tyro.conf.FlagCreatePairsOff,)
+    prog = f"viewmend {command.name}"
+    flags = (tyro.conf.FlagCreatePairsOff,)
     if hasattr(module, "parse"):
         options = module.parse(arguments, prog)
     else:

@@ -75,7 +75,8 @@ def _by_board(options: Options, out: Path) -> Figures:
     from viewmend.preprocess.calibration.bundle import calibrate, residual_picture
 
     assert options.board is not None
-    board, footage = parse_board(options.board, options.dictionary), open_footage(options.source)
+    board = parse_board(options.board, options.dictionary)
+    footage = open_footage(options.source)
     times = chosen_times(options.frames, len(footage.frames))[:: options.every]
     seen = look_for(board, footage, times, lambda cameras: track(cameras, "looking for the board"))
     sizes = [(camera.width, camera.height) for camera in footage.cameras]

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
+    from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.checks.calibration import CalibrationCheck
-    from viewmend.data.native_capture import NativeCapture
     from viewmend.types import MultiViewFrame
+
+FEW_CAMERAS = 6
+"""Artefacts are expected with fewer cameras."""
+WIDE_DEG = 60.0
+"""Artefacts are expected if neighbouring cameras are farther apart than this angle, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,22 +52,18 @@ def run(options: Options) -> int:
     return 0
 
 
-FEW_CAMERAS, WIDE_DEG = 6, 60.0
-"""With fewer cameras, or larger angles between neighbours, artefacts are expected."""
-
-
-def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, tuple[str, ...]]":
+def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, tuple[str, ...]]":
     """The capture, what is wrong with it, and what `mend` would change."""
     from viewmend.cli.console import busy, say
+    from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.checks.calibration import check_calibration, draw_check
     from viewmend.data.checks.synchronisation import find_desynchronised_cameras
     from viewmend.data.errors import without_consequences
     from viewmend.data.images import check_image_name, write_image
-    from viewmend.data.native_capture import NativeCapture
     from viewmend.data.prepare import adjustments
     from viewmend.utils.atomic_writes import remove_partial_file
 
-    capture = NativeCapture(options.capture, format=options.format)
+    capture = CaptureFolder(options.capture, format=options.format)
     if options.out is not None:
         check_image_name(options.out)
     frame = _frame(capture, options)
@@ -81,7 +82,7 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     return capture, check, changes
 
 
-def _frame(capture: "NativeCapture", options: Options) -> "MultiViewFrame":
+def _frame(capture: "CaptureFolder", options: Options) -> "MultiViewFrame":
     """The frame to check; ValueError if there is no such frame, or no subject in it."""
     from viewmend.data.prepare import first_with_subject
 
@@ -97,9 +98,11 @@ def _frame(capture: "NativeCapture", options: Options) -> "MultiViewFrame":
     return frame
 
 
-def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dict[str, Any]:
+def describe_capture(capture: "CaptureFolder", check: "CalibrationCheck") -> dict[str, Any]:
     """The `--json` output: properties of a capture and the results of the check. Lengths are in metres."""
-    cameras, bounds, iou = capture.cameras, capture.bounds, list(check.iou.values())
+    cameras = capture.cameras
+    bounds = capture.bounds
+    iou = list(check.iou.values())
     distance = (cameras.centers - check.bounds.center).norm(dim=-1)
     directions = (cameras.centers - check.bounds.center) / distance[:, None]
     apart = (directions @ directions.mT).clamp(-1, 1).fill_diagonal_(-1).acos().amin(1).median().rad2deg()
@@ -130,10 +133,12 @@ def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dic
     }
 
 
-def _describe_camera(capture: "NativeCapture", check: "CalibrationCheck", view: int) -> dict[str, Any]:
+def _describe_camera(capture: "CaptureFolder", check: "CalibrationCheck", view: int) -> dict[str, Any]:
     """A camera after undistortion. Its hull IoU is None without masks, and if it is absent from the checked frame."""
     camera = capture.cameras[view]
-    (name,), (width, height), K = camera.names, camera.max_size_px, camera.K[0]
+    (name,) = camera.names
+    width, height = camera.max_size_px
+    K = camera.K[0]
     return {
         "name": name,
         "width": width,
@@ -149,7 +154,9 @@ def _describe_camera(capture: "NativeCapture", check: "CalibrationCheck", view: 
 def _capture_as_text(capture: dict[str, Any]) -> list[str]:
     sizes = sorted({(camera["width"], camera["height"]) for camera in capture["cameras"]})
     fps = "unknown fps" if capture["fps"] is None else f"{capture['fps']:g} fps"
-    bounds, iou, (near, far) = capture["bounds_m"], capture["hull_iou_mean"], capture["camera_distance_m"]
+    bounds = capture["bounds_m"]
+    iou = capture["hull_iou_mean"]
+    near, far = capture["camera_distance_m"]
     frames = f"{capture['frames']}, '{capture['first_frame']}' to '{capture['last_frame']}', {fps}"
     if capture["frames"] == 1:
         frames = f"1 ('{capture['first_frame']}'), static"

@@ -29,7 +29,8 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
     if total is None and hasattr(items, "__len__"):
         total = len(items)  # pyright: ignore[reportArgumentType]
     if not sys.stderr.isatty():
-        start, done = time.monotonic(), 0
+        start = time.monotonic()
+        done = 0
 
         def text() -> str:
             if not total:
@@ -151,12 +152,14 @@ def stop_requests() -> Iterator[Callable[[], int]]:
 
     Yields a function that returns the number of the first signal, or 0 if there was none.
     """
-    first, at_s = 0, 0.0
+    first = 0
+    at_s = 0.0
 
     def request(number: int, _: object) -> None:
         nonlocal first, at_s
         if not first:
-            first, at_s = number, time.monotonic()
+            first = number
+            at_s = time.monotonic()
             say("stopping after this step and saving a checkpoint; press Ctrl-C again to stop at once")
         elif number == signal.SIGINT and time.monotonic() - at_s > REPEATED_S:
             raise KeyboardInterrupt

@@ -32,7 +32,7 @@ def run(options: Options) -> int:
     """Run the command and return the exit code."""
     from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import say, track
-    from viewmend.data.native_capture import open_capture
+    from viewmend.data.capture_folder import open_capture
     from viewmend.data.native_writer import write_capture
     from viewmend.data.source import CaptureSubset
 

@@ -70,7 +70,8 @@ def run(options: Options) -> int:
     path = _path(options)
     error_model = error_model_for(inpainter) if render.error_rule == "predicted" else None
     mender = Mender(inpainter, StreamConfig(render=render, memory_mb=None), studio.bounds, error_model=error_model)
-    summary, steps = MendSummary(), []
+    summary = MendSummary()
+    steps = []
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
         for frame in track(prefetch(studio), "completing", options.frames):

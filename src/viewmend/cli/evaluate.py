@@ -174,7 +174,8 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     settings = RunSettings(stream=stream, background=options.score_background, networks=networks, **same)
     if missing or missing_networks:
         say(f"n/a (the report has the reasons): {', '.join(missing | missing_networks)}")
-    store, cells = CellStore(options.out / "cells"), []
+    store = CellStore(options.out / "cells")
+    cells = []
     steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
     for cell in track((cell for found in steps for cell in found), "evaluating", len(scenes) * len(available)):
         cells.append(cell)

@@ -77,7 +77,8 @@ def run(options: Options) -> int:
     stream = Stream(inpainter, StreamConfig(geometry=options.geometry), opened.bounds, depth_model)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
-        prepared, size = asdict(options.preparation), options.max_image_size
+        prepared = asdict(options.preparation)
+        size = options.max_image_size
         capture = prepare(opened, max_image_size=size, **prepared, first=times[0])
         log_preparation(capture)
         shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
@@ -103,7 +104,8 @@ def _views(options: Options, first: "CachedFrame", rig: "Cameras", up: "Tensor |
     if options.path is not None:
         return read_camera_path(options.path, rig)
     assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
-    center, count = first.proxy.mesh.vertices.mean(0).cpu(), options.views
+    center = first.proxy.mesh.vertices.mean(0).cpu()
+    count = options.views
     around = orbit_around(center, rig, up, count, count)
     # A rig on one side makes the path swing to and fro: then only its way there is used.
     swings = count > 2 and around.centers[1].allclose(around.centers[-1], atol=1e-4)

@@ -85,7 +85,8 @@ def _make(options: Options) -> None:
     if count <= 0:
         say(f"{options.out}: already holds {at.samples} samples")
         return
-    began, shards = time.monotonic(), []
+    began = time.monotonic()
+    shards = []
     samples = islice(_missing(at, samples_in_order(source, at.scene, options.workers)), count)
     for shard in write_shards(track(samples, "samples", count), options.out, options.objective.shard_size, at.shards):
         shards.append(shard)
@@ -113,9 +114,12 @@ def _missing(at: Position, numbered: Iterator[tuple[int, int, Item]]) -> Iterato
     skipped = at.sample
     for scene, number, sample in numbered:
         if scene > at.scene:
-            at.scene, at.sample, skipped = scene, 0, 0
+            at.scene = scene
+            at.sample = 0
+            skipped = 0
         if number >= skipped:
-            at.sample, at.samples = number + 1, at.samples + 1
+            at.sample = number + 1
+            at.samples = at.samples + 1
             yield sample
 
 
@@ -128,7 +132,8 @@ def _position(out: Path) -> Position:
     from viewmend.training.shards import shards_of
     from viewmend.utils.untrusted_input import bounded_bytes, read_json, typed
 
-    names, file = [path.name for path in shards_of(out) if path.name.startswith("shard-")], out / POSITION
+    names = [path.name for path in shards_of(out) if path.name.startswith("shard-")]
+    file = out / POSITION
     for number, name in enumerate(names):
         if name != f"shard-{number:05d}.tar":
             raise ValueError(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from viewmend.data.native_capture import NativeCapture
+    from viewmend.data.capture_folder import CaptureFolder
     from viewmend.preprocess.masks.maker import Rgb
     from viewmend.preprocess.masks.masked import MaskedCapture
 
@@ -51,8 +51,8 @@ def run(options: Options) -> int:
     """Run the command and return the exit code."""
     from viewmend.cli.checks import chosen_times, without_subject
     from viewmend.cli.console import say, track
+    from viewmend.data.capture_folder import open_capture
     from viewmend.data.errors import CaptureError
-    from viewmend.data.native_capture import open_capture
     from viewmend.data.native_writer import write_capture
     from viewmend.data.source import CaptureSubset
 
@@ -89,7 +89,7 @@ def _check(options: Options) -> None:
         raise CaptureError(f"{options.out}: expected a new or empty folder, got one with files; choose another")
 
 
-def _masked(options: Options, capture: "NativeCapture", part) -> "MaskedCapture":
+def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture":
     from viewmend.cli.checks import chosen_times
     from viewmend.preprocess.masks.maker import KEYS, ChromaMasks
     from viewmend.preprocess.masks.masked import MaskedCapture
@@ -97,7 +97,8 @@ def _masked(options: Options, capture: "NativeCapture", part) -> "MaskedCapture"
     from viewmend.preprocess.masks.person import PersonMasks
     from viewmend.preprocess.masks.plate import PlateMasks, plates_from_files, plates_from_frames
 
-    names, plates = capture.cameras.names, {}
+    names = capture.cameras.names
+    plates = {}
     if options.plate is not None:
         plates = plates_from_files(capture, options.plate)
     elif options.plate_frames is not None:
@@ -116,7 +117,7 @@ def _masked(options: Options, capture: "NativeCapture", part) -> "MaskedCapture"
     return MaskedCapture(part, makers, "none" if options.no_clean else "pixels", screens)
 
 
-def _screen(capture: "NativeCapture", name: str, channel: int) -> "Rgb":
+def _screen(capture: "CaptureFolder", name: str, channel: int) -> "Rgb":
     """A plain image in the colour of the screen."""
     import numpy as np
 

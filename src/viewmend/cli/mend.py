@@ -12,7 +12,7 @@ from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
     from viewmend.data.camera_path import Turntable
-    from viewmend.data.native_capture import NativeCapture
+    from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.source import CaptureSource
     from viewmend.geometry.cameras import Cameras
 
@@ -116,7 +116,8 @@ def run(options: Options) -> int:
     summary = MendSummary(options.protocol)
     mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
-    frames, frame = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)]), None
+    frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])
+    frame = None
     fps = (turntable and turntable.fps) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
@@ -149,19 +150,20 @@ def _check(options: Options) -> None:
     check_least(options, top_k=1)
 
 
-def _open(options: Options, held: tuple[str, ...]) -> "NativeCapture":
+def _open(options: Options, held: tuple[str, ...]) -> "CaptureFolder":
     from viewmend.data.errors import CaptureError
     from viewmend.data.prepare import open_masked
 
     names = list(dict.fromkeys([*options.cameras, *held])) if options.cameras else None
     capture = open_masked(options.capture, names, held=len(held), format=options.format)
     if not set(held) <= set(capture.cameras.names):
-        known, got = list(capture.cameras.names), options.leave_out
+        known = list(capture.cameras.names)
+        got = options.leave_out
         raise CaptureError(f"{options.capture}: expected --leave-out among {known}, got '{got}'")
     return capture
 
 
-def _usable(capture: "NativeCapture", times: range, held: tuple[str, ...]) -> list[int]:
+def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
     """The times at which two input cameras or more are present; says which are not.
 
     Raises:
@@ -185,7 +187,7 @@ def _plan(
 ) -> "list[tuple[int, Cameras]]":
     """Frame indices and the camera of each view, in order."""
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
-    from viewmend.data.native_capture import origin_of
+    from viewmend.data.capture_folder import origin_of
 
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in times]
@@ -202,11 +204,13 @@ def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int])
 
     from viewmend.geometry.orbit import coarse_surface, fit_to, orbit_around, thinned
 
-    shown, points = turntable.times(usable, capture.fps), []
+    shown = turntable.times(usable, capture.fps)
+    points = []
     for frame in map(capture.read, thinned(sorted(set(shown)))):
         assert frame.mask is not None, "captures without masks are refused"
         points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
-    extent, views = torch.cat(points), len(shown)
+    extent = torch.cat(points)
+    views = len(shown)
     if not len(extent):
         raise ValueError(
             f"{capture.name}: expected a subject to circle, got none in these frames; choose other --frames"

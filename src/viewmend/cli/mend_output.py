@@ -32,7 +32,10 @@ class MendOutput:
     """Context manager that collects views in a hidden draft folder, and publishes the files if there was no error."""
 
     def __init__(self, out: Path, fps: float, alpha: bool = False, depth: bool = False):
-        self._folder, self._fps, self._alpha, self._depth = OutputFolder(out), fps, alpha, depth
+        self._folder = OutputFolder(out)
+        self._fps = fps
+        self._alpha = alpha
+        self._depth = depth
         self._draft = self._folder.draft
         self._count = 0
         self._rows: list[list[Tile]] = []
@@ -60,7 +63,8 @@ class MendOutput:
 
     def add(self, step: MendStep) -> None:
         """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
-        completed, number = step.completed, f"{self._count:06d}.png"
+        completed = step.completed
+        number = f"{self._count:06d}.png"
         shown = {"completed": step.completed_rgb, "holes": completed.view.error[None], "rendered": step.rendered}
         for name, image in (shown if step.truth is None else shown | {"true": step.truth}).items():
             write_image(self._draft / name / number, picture(image))
@@ -70,7 +74,8 @@ class MendOutput:
             write_depth(self._draft / "depth" / number, depth_image_m(completed))
         if self._count % self._stride == 0:
             if len(self._rows) == SHEET_ROWS:
-                self._rows, self._stride = self._rows[::2], 2 * self._stride
+                self._rows = self._rows[::2]
+                self._stride = 2 * self._stride
             if self._count % self._stride == 0:
                 self._rows.append(sheet_row(step))
         self._count += 1
@@ -117,7 +122,9 @@ def side_by_side(images: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt
 
 def sheet_row(step: MendStep) -> list[Tile]:
     """Source cameras, rendered, holes, completed, alpha and confidence, true, differences; cropped to the subject."""
-    completed, view, truth = step.completed, step.completed.view, step.truth
+    completed = step.completed
+    view = step.completed.view
+    truth = step.truth
     empty = float(step.background == "white")
     box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth != empty).any(0))
     tiles = []
@@ -138,11 +145,15 @@ def sheet_row(step: MendStep) -> list[Tile]:
 
 def _box(mask: Tensor) -> tuple[slice, slice]:
     """Rows and columns of the mask with a margin; everything for an empty mask."""
-    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    rows = mask.any(1).nonzero()[:, 0]
+    columns = mask.any(0).nonzero()[:, 0]
     if not len(rows):
         return slice(None), slice(None)
     margin = 4 + len(rows) // 20
-    top, bottom, left, right = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
+    top = int(rows[0])
+    bottom = int(rows[-1])
+    left = int(columns[0])
+    right = int(columns[-1])
     return slice(max(0, top - margin), bottom + 1 + margin), slice(max(0, left - margin), right + 1 + margin)
 
 
@@ -165,7 +176,8 @@ def in_words(summary: MendSummary) -> list[str]:
         f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}",
     ]
     for kind, metric in {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}.items():
-        ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)
+        ours = summary.mean("ours", metric)
+        telea = summary.mean("telea", metric)
         lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
     lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
     return [*lines, f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}"]

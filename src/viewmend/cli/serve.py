@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 
 TOKEN_VARIABLE = "VIEWMEND_TOKEN"
 RIG_SOURCE = "viewmend.contrib.live_rig.rig_source:RigFileSource"
-RAY_SETTINGS, SERVE_ON_RAY = "viewmend.contrib.ray.replicas:ManyViewers", "viewmend.contrib.ray.replicas:serving"
-"""Optional parts, as MODULE:NAME; those of the server itself are in `live.server.EXTENSIONS`."""
+"""The source of frames of live rigs, as MODULE:NAME."""
+RAY_SETTINGS = "viewmend.contrib.ray.replicas:ManyViewers"
+"""The settings of a server for many viewers, as MODULE:NAME."""
+SERVE_ON_RAY = "viewmend.contrib.ray.replicas:serving"
+"""The server for many viewers, as MODULE:NAME."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +113,10 @@ def run(options: Options) -> int:
     configure_allocator()
     config = server_config(options)
     source = open_source(options)
-    inpainter, device = load_inpainter(options), options.device
-    errors, in_page = error_model_for(inpainter, device), config.draws_in_page
+    inpainter = load_inpainter(options)
+    device = options.device
+    errors = error_model_for(inpainter, device)
+    in_page = config.draws_in_page
     renderer = Renderer(
         source,
         inpainter,
@@ -125,7 +130,8 @@ def run(options: Options) -> int:
     server = Server(live, config)
     with server.bind() as address:
         freeze_loaded_objects()
-        query, address = token_query(config.token), (config.public_url or address).rstrip("/")
+        query = token_query(config.token)
+        address = (config.public_url or address).rstrip("/")
         say(f"open {address}/{query}   (Ctrl-C stops it)")
         for extension in live.extensions:
             if extension.notice:
@@ -209,7 +215,8 @@ def open_source(options: Options) -> "FrameSource":
     from viewmend.live.frame_source import RecordedSource
     from viewmend.live.push import PushSource
 
-    memory_mb, size_px = options.memory_mb / 2, options.max_image_size
+    memory_mb = options.memory_mb / 2
+    size_px = options.max_image_size
     prepared = asdict(options.preparation)
     if options.source == "live":
         return PushSource(options.fps, memory_mb)

@@ -106,7 +106,8 @@ def run(options: Options) -> int:
 
 def _show_gain(options: Options) -> None:
     """After fine-tuning: the scores before and after by camera, and a contact sheet."""
-    scenes, start = options.config.scenes, options.config.start
+    scenes = options.config.scenes
+    start = options.config.start
     if scenes.hold_out is None or start is None or not scenes.captures:
         return
     from viewmend.cli.console import say

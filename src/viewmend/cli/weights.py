@@ -44,13 +44,15 @@ def _describe(known: "KnownWeights", path: Path | None) -> dict[str, str]:
     from viewmend.metrics.weights import stated_hash, verify_weights
     from viewmend.utils.weight_files import WeightsError
 
-    status, problem = "missing", ""
+    status = "missing"
+    problem = ""
     if path is not None:
         status = "verified" if known.sha256 else "found (no hash was published; loading checks shapes)"
         try:
             verify_weights(path, known)
         except WeightsError as error:
-            status, problem = "wrong", str(error)
+            status = "wrong"
+            problem = str(error)
     return {
         **{"name": known.name, "status": status, "path": "" if path is None else str(path)},
         **{"files": " or ".join(known.files), "what": known.what, "source": known.source},

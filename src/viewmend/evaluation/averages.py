@@ -213,14 +213,16 @@ def _table(title: str, cells: Sequence[Cell], methods: Sequence[str]) -> Table:
     # All methods of a scene have the same frames: count them in any cell that did not fail.
     frames = [f for cell in {c.key.scene: c for c in cells if c.error is None}.values() for f in cell.frames]
     sizes = dict.fromkeys((f.width_px, f.height_px) for f in frames)
-    thin, empty = len(frames) - len(frames_with_holes(frames)), sum(f.hole_px == 0 for f in frames)
+    thin = len(frames) - len(frames_with_holes(frames))
+    empty = sum(f.hole_px == 0 for f in frames)
     scores = records(cells)
     rows = tuple(_row(name, [c for c in cells if c.key.method == name], scores) for name in methods)
     return Table(title, rows, len(frames), thin, empty, tuple(sizes))
 
 
 def _row(method: str, cells: Sequence[Cell], scores: Records) -> Row:
-    done, own = [cell for cell in cells if cell.error is None], scores.where(method=method)
+    done = [cell for cell in cells if cell.error is None]
+    own = scores.where(method=method)
     gained = gains(own, scores.where(method=REFERENCE)).values()
     return Row(
         method=method,

@@ -136,7 +136,8 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
         names = methods.get(row.method, (row.method,))
         done = [of[name] for name in names if name in of and of[name].scenes]
         ours = [number(_mean(done, metric, of), 1, digits, "n/a") for _, metric, of, digits in COLUMNS]
-        shown, failed = ", ".join(Path(name).name for name in names) or "none", sum(one.failed for one in done)
+        shown = ", ".join(Path(name).name for name in names) or "none"
+        failed = sum(one.failed for one in done)
         lines.append((row.label, f"{shown} (**{failed} failed**)" if failed else shown, *ours, *row.figures))
     return Grid((*heads, *paper), tuple(lines))
 

@@ -37,7 +37,8 @@ def provenance(device: str, threads: int, jobs: int) -> Provenance:
     head = _git("ls-files", "--", Path(__file__).name) and _git("rev-parse", "--short", "HEAD")
     load = round(os.getloadavg()[0], 1)
     changed = head and _git("status", "--porcelain", "--untracked-files=no", "--", ".")
-    commit, python = f"{head}{'+' if changed else ''}" or "unknown", platform.python_version()
+    commit = f"{head}{'+' if changed else ''}" or "unknown"
+    python = platform.python_version()
     return Provenance(__version__, commit, python, torch.__version__, name, threads, jobs, load)
 
 
@@ -49,7 +50,8 @@ def _processor() -> str:
 
 
 def _git(*arguments: str) -> str:
-    command, folder = ["git", *arguments], Path(__file__).parent
+    command = ["git", *arguments]
+    folder = Path(__file__).parent
     try:
         return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
     except OSError:

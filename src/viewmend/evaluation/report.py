@@ -74,8 +74,10 @@ COLUMNS = (
     ("still", "change", "still", 255, 2),
 )
 """Columns of the main table: heading, metric, region, factor, decimals."""
-HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker", "lpips_alex")
-"""Metrics whose largest, or smallest, mean is the best."""
+HIGHER = ("psnr", "ssim", "alpha_iou")
+"""The largest mean of these metrics is the best."""
+LOWER = ("flicker", "lpips_alex")
+"""The smallest mean of these metrics is the best."""
 SPREAD = (
     ("psnr", "holes"),
     ("psnr", "holes_fg"),
@@ -147,7 +149,8 @@ class Grid:
 
 def setting_lines(report: Report) -> list[str]:
     """The settings and the origin of the figures."""
-    settings, render = report.settings, report.settings.stream.render
+    settings = report.settings
+    render = report.settings.stream.render
     lines = [
         f"Protocol {settings.protocol}; version {report.protocol} of the scores; {settings.device}, "
         f"{settings.precision}; {render.cameras} source cameras by {render.selection}; error rule "

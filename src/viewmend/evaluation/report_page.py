@@ -62,10 +62,12 @@ def scene_sheet(cells: Sequence[Cell], store: CellStore) -> Picture | None:
     if images is None:
         return None
     top, left, side = largest_hole(images.error)
-    close, columns = (slice(top, top + side), slice(left, left + side)), _columns(cells, images, store)
+    close = (slice(top, top + side), slice(left, left + side))
+    columns = _columns(cells, images, store)
     rows = [[Tile(label, image) for label, image in columns], [], []]
     for label, image in columns:
-        near, difference = None if image is None else np.ascontiguousarray(image[close]), None
+        near = None if image is None else np.ascontiguousarray(image[close])
+        difference = None
         if near is not None and label not in ("E", "truth"):
             off = np.abs(near.astype(np.int16) - images.truth[close])
             difference = (off * DIFFERENCE_GAIN).clip(0, 255).astype(np.uint8)
@@ -81,7 +83,10 @@ def largest_hole(error: Picture) -> tuple[int, int, int]:
     height, width = error.shape[:2]
     count, _, stats, _ = cv2.connectedComponentsWithStats((error[..., 0] > 0).astype(np.uint8), connectivity=8)
     smallest = max(1, min(height, width) // CLOSE_UP_SHARE)
-    x, y, wide, high = 0, 0, width, height
+    x = 0
+    y = 0
+    wide = width
+    high = height
     if count > 1:
         part = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
         x, y, wide, high = (int(v) for v in stats[part, :4])

@@ -106,7 +106,8 @@ def evaluate_scene(
     """
     loaded = {} if loaded is None else loaded
     scorers = load_scorers(settings.background, settings.ssim, settings.networks, settings.device)
-    images, videos = None, VideoFeatures(scorers.i3d)
+    images = None
+    videos = VideoFeatures(scorers.i3d)
     streams = [_MethodStream(name, settings, scorers, loaded) for name in methods]
     try:
         with torch.no_grad():
@@ -127,7 +128,8 @@ def evaluate_scene(
 
 
 def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, Inpainter]) -> Iterator[_Frame]:
-    most, last = -1, None
+    most = -1
+    last = None
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
     depth_model = error_model_for(Unfilled(), settings.device) if config.geometry == "fused" else None
     for frame in (to_device(own, settings.device) for own in scene.frames()):
@@ -141,20 +143,24 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, In
             predictor = MaskPredictor(loaded[MASK_MODEL], settings.stream, frame.bounds)
             target_mask = predictor.predict(cached, frame.truth.cameras)
         view = stream.render(frame.truth.cameras, target_mask=target_mask)
-        holes, scored = int(view.holes.sum()), frame.inputs.time >= scene.scored_from
+        holes = int(view.holes.sum())
+        scored = frame.inputs.time >= scene.scored_from
         origins = None if frame.seen is None else frame.seen.origins(view.source_views)
         truth = true_view(frame.truth, settings.background, frame.backward_flow_px, origins)
         last = _Frame(cached, frame.bounds, view, truth, scored, last, scored and holes > most)
         yield last
-        most, last = max(most, holes) if scored else most, replace(last, previous=None)
+        most = max(most, holes) if scored else most
+        last = replace(last, previous=None)
 
 
 class _MethodStream:
     """One method's stream through the scene."""
 
     def __init__(self, method: str, settings: RunSettings, scorers: Scorers, loaded: dict[str, Inpainter]) -> None:
-        self.method, self._loaded = method, loaded
-        self._settings, self._scorers = settings, scorers
+        self.method = method
+        self._loaded = loaded
+        self._settings = settings
+        self._scorers = scorers
         self._sequence: ViewSequence | None = None
         self._error: str | None = None
         self._previous: torch.Tensor | None = None
@@ -194,7 +200,8 @@ class _MethodStream:
 
     def _score(self, sequence: ViewSequence, frame: _Frame) -> None:
         made = sequence.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)
-        completed, previous = made.completed, None
+        completed = made.completed
+        previous = None
         _check(completed)
         rgb = composite(self._settings.background, completed.rgb, completed.opacity)
         if frame.previous is not None and self._previous is not None:
@@ -209,13 +216,15 @@ class _MethodStream:
     def result(self) -> MethodRun:
         if self._error is not None:
             return MethodRun(self.method, error=self._error)
-        scores, step_ms = tuple(self._scores), tuple(self._step_ms)
+        scores = tuple(self._scores)
+        step_ms = tuple(self._step_ms)
         return MethodRun(self.method, scores, step_ms, image=self._image, features=self._videos.features())
 
 
 def _check(completed: CompletedView) -> None:
     """Check that a view is complete, and unchanged outside of E."""
-    rgb, view = completed.rgb, completed.view
+    rgb = completed.rgb
+    view = completed.view
     if rgb.shape != view.rgb.shape:
         raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view")
     if changed := int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum()):

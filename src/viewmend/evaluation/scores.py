@@ -71,7 +71,8 @@ def available_networks() -> tuple[tuple[str, ...], dict[str, str]]:
     Raises:
         WeightsError: weights are installed but wrong.
     """
-    there, missing = [], {}
+    there = []
+    missing = {}
     for name, (_, load) in NETWORKS.items():
         try:
             load("cpu")
@@ -191,12 +192,15 @@ def score_view(
     completed: CompletedView, truth: TrueView, scorers: Scorers, previous: PreviousView | None = None
 ) -> ViewScores:
     """All scores of one completed view; the temporal ones need the previous frame."""
-    view, background = completed.view, scorers.background
+    view = completed.view
+    background = scorers.background
     rgb = composite(background, completed.rgb, completed.opacity)
     rendered = composite(background, view.cut_rgb, view.silhouette)
-    hull, holes = view.mask > 0.5, view.holes
+    hull = view.mask > 0.5
+    holes = view.holes
     height, width = holes.shape
-    whole, whole_rendered = psnr(rgb, truth.rgb), psnr(rendered, truth.rgb)
+    whole = psnr(rgb, truth.rgb)
+    whole_rendered = psnr(rendered, truth.rgb)
     assert whole is not None and whole_rendered is not None, "images have pixels"
     maps = {"lpips_alex": scorers.lpips_alex, "lpips_vgg": scorers.lpips_vgg}
     maps["ssim"] = None if scorers.ssim is None else partial(ssim_map, window=scorers.ssim)
@@ -271,7 +275,10 @@ def _readings(
 def _temporal(
     now: Float[Tensor, "3 height width"], view: IncompleteView, truth: TrueView, previous: PreviousView
 ) -> dict[str, float | None]:
-    then, true_now, true_then, shown = previous.rgb, truth.rgb, previous.truth, (view.mask > 0) | truth.mask
+    then = previous.rgb
+    true_now = truth.rgb
+    true_then = previous.truth
+    shown = (view.mask > 0) | truth.mask
     still = shown & ((true_now - true_then).abs().amax(0) < STILL)
     found = {"change_still": change(now, then, still, MIN_HOLE_PX)}
     if (flow := truth.backward_flow_px) is not None:

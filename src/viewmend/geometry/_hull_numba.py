@@ -14,7 +14,8 @@ def soften(mask, rows, columns, pool, out):
 
     Beyond the image's own rows and columns its border continues, in the last row and column of `out` as well.
     """
-    height, width = out.shape[0] - 1, out.shape[1] - 1
+    height = out.shape[0] - 1
+    width = out.shape[1] - 1
     smooth = np.empty((height, width), np.int32)
     column_sums = np.empty(width * pool, np.int32)
     pooled = np.empty(width, np.int32)
@@ -37,7 +38,8 @@ def soften(mask, rows, columns, pool, out):
         smooth[y, width - 1] = pooled[max(width - 2, 0)] + 3 * pooled[width - 1]
     scale = np.float32(1) / np.float32(16 * pool * pool)
     for y in range(height):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        above = max(y - 1, 0)
+        below = min(y + 1, height - 1)
         for x in range(width):
             total = smooth[above, x] + 2 * smooth[y, x] + smooth[below, x]
             out[y, x] = np.uint8(np.float32(total) * scale + np.float32(0.5))
@@ -49,7 +51,8 @@ def soften(mask, rows, columns, pool, out):
 def count_tiles(image, rows, columns, tile, sums):
     """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1])."""
     sums[:] = 0
-    largest, smallest = np.empty(columns, np.uint8), np.empty(columns, np.uint8)
+    largest = np.empty(columns, np.uint8)
+    smallest = np.empty(columns, np.uint8)
     for ty in range(sums.shape[0] - 1):
         largest[:] = 0
         smallest[:] = 255
@@ -59,7 +62,8 @@ def count_tiles(image, rows, columns, tile, sums):
                 largest[x] = max(largest[x], line[x])
                 smallest[x] = min(smallest[x], line[x])
         for tx in range(sums.shape[1] - 1):
-            some, full = 0, 1
+            some = 0
+            full = 1
             for x in range(tx * tile, min(tx * tile + tile, columns)):
                 some |= largest[x] > 0
                 full &= smallest[x] == 255
@@ -79,18 +83,22 @@ def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
         return UNSEEN
     if depth - radius <= NEAR_M:
         return MIXED
-    inverse, reach = 1 / depth, radius / (depth - radius)
+    inverse = 1 / depth
+    reach = radius / (depth - radius)
     u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) * inverse
     v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) * inverse
     du = np.sqrt(lens[0] + (lens[1] - u) ** 2) * reach
     dv = np.sqrt(lens[2] + (lens[3] - v) ** 2) * reach
-    width, height = size[0], size[1]
+    width = size[0]
+    height = size[1]
     if u + du < 0 or u - du >= width or v + dv < 0 or v - dv >= height:
         return UNSEEN
     if u - du < 0 or u + du >= width or v - dv < 0 or v + dv >= height:
         return MIXED
     # Bilinear sampling reads the pixel before and the one after.
-    shrink, last_x, last_y = 1 / (pool * tile), sums.shape[1] - 2, sums.shape[0] - 2
+    shrink = 1 / (pool * tile)
+    last_x = sums.shape[1] - 2
+    last_y = sums.shape[0] - 2
     margin = 1.5 * pool
     left = np.int64(max(u - du - margin, 0.0) * shrink)
     right = min(np.int64((u + du + margin) * shrink), last_x) + 1
@@ -125,16 +133,20 @@ def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, slab, occup
 @kernel
 def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, block, first, values):
     """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
-    end_x, end_y, end_z = min(first + block, values.shape[0]), values.shape[1], values.shape[2]
+    end_x = min(first + block, values.shape[0])
+    end_y = values.shape[1]
+    end_z = values.shape[2]
     radius = voxel_m * np.sqrt(3.0) / 2 * (block - 1) + 1e-9
-    order, mixed = np.arange(P.shape[0]), np.empty(P.shape[0], np.int64)
+    order = np.arange(P.shape[0])
+    mixed = np.empty(P.shape[0], np.int64)
     scratch = np.empty((8, block**3), np.float32)
     for first_y in range(0, end_y, block):
         for first_z in range(0, end_z, block):
             x = low[0] + (first + block / 2) * voxel_m
             y = low[1] + (first_y + block / 2) * voxel_m
             z = low[2] + (first_z + block / 2) * voxel_m
-            seen, undecided = 0, 0
+            seen = 0
+            undecided = 0
             for n in range(len(order)):
                 view = order[n]
                 verdict = judge(P[view], lens[view], x, y, z, radius, size[view], pool, tile, sums[view])
@@ -164,7 +176,12 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
 
     One camera after another is asked about the voxels that are left, gathered at the front of `scratch`.
     """
-    x, y, z, smallest, seen, place = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
+    x = scratch[0]
+    y = scratch[1]
+    z = scratch[2]
+    smallest = scratch[3]
+    seen = scratch[4]
+    place = scratch[5]
     left = 0
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
@@ -184,7 +201,8 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
         if left == 0:
             break
     values[:] = 0
-    plane, line = np.uint32(values.shape[1] * values.shape[2]), np.uint32(values.shape[2])
+    plane = np.uint32(values.shape[1] * values.shape[2])
+    line = np.uint32(values.shape[2])
     for n in range(left):
         if seen[n] >= needed:
             at = np.uint32(place[n])
@@ -194,19 +212,35 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
 @kernel(fastmath=True)
 def locate(P, origin, voxel_m, size, pool, count, scratch):
     """Where the first `count` voxels are in one camera's pooled mask: scratch[6:8]; -1 in scratch[6] if out of view."""
-    base, step = np.empty(3, np.float32), np.empty((3, 3), np.float32)
+    base = np.empty(3, np.float32)
+    step = np.empty((3, 3), np.float32)
     for row in range(3):
         scale = 1.0 if row == 2 else 1.0 / pool
         base[row] = scale * (P[row, 0] * origin[0] + P[row, 1] * origin[1] + P[row, 2] * origin[2] + P[row, 3])
         for axis in range(3):
             step[row, axis] = scale * voxel_m * P[row, axis]
-    u0, v0, w0 = base[0], base[1], base[2]
-    ux, uy, uz = step[0, 0], step[0, 1], step[0, 2]
-    vx, vy, vz = step[1, 0], step[1, 1], step[1, 2]
-    wx, wy, wz = step[2, 0], step[2, 1], step[2, 2]
-    width, height = np.float32(size[0] / pool), np.float32(size[1] / pool)
-    one, nothing, near = np.float32(1), np.float32(0), np.float32(NEAR_M)
-    x, y, z, us, vs = scratch[0], scratch[1], scratch[2], scratch[6], scratch[7]
+    u0 = base[0]
+    v0 = base[1]
+    w0 = base[2]
+    ux = step[0, 0]
+    uy = step[0, 1]
+    uz = step[0, 2]
+    vx = step[1, 0]
+    vy = step[1, 1]
+    vz = step[1, 2]
+    wx = step[2, 0]
+    wy = step[2, 1]
+    wz = step[2, 2]
+    width = np.float32(size[0] / pool)
+    height = np.float32(size[1] / pool)
+    one = np.float32(1)
+    nothing = np.float32(0)
+    near = np.float32(NEAR_M)
+    x = scratch[0]
+    y = scratch[1]
+    z = scratch[2]
+    us = scratch[6]
+    vs = scratch[7]
     for n in range(count):
         depth = w0 + x[n] * wx + y[n] * wy + z[n] * wz
         inverse = one / max(depth, near)
@@ -220,20 +254,33 @@ def locate(P, origin, voxel_m, size, pool, count, scratch):
 @kernel(fastmath=True)
 def sample(image, count, scratch):
     """Lower the first `count` voxels' values to the mask's at scratch[6:8]; move those still above 0 to the front."""
-    x, y, z, smallest, seen, place = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
-    us, vs = scratch[6], scratch[7]
-    half, nothing, one = np.float32(0.5), np.float32(0), np.float32(1)
-    last_y, last_x = np.float32(image.shape[0] - 2), np.float32(image.shape[1] - 2)
+    x = scratch[0]
+    y = scratch[1]
+    z = scratch[2]
+    smallest = scratch[3]
+    seen = scratch[4]
+    place = scratch[5]
+    us = scratch[6]
+    vs = scratch[7]
+    half = np.float32(0.5)
+    nothing = np.float32(0)
+    one = np.float32(1)
+    last_y = np.float32(image.shape[0] - 2)
+    last_x = np.float32(image.shape[1] - 2)
     kept = 0
     for n in range(count):
         value = smallest[n]
         if us[n] >= 0:
             seen[n] += one
-            u, v = min(max(us[n] - half, nothing), last_x), min(max(vs[n] - half, nothing), last_y)
+            u = min(max(us[n] - half, nothing), last_x)
+            v = min(max(vs[n] - half, nothing), last_y)
             # Unsigned, so that numba does not look for negative indices.
-            left, top = np.uint32(np.int32(u)), np.uint32(np.int32(v))
-            right, bottom = np.uint32(left + 1), np.uint32(top + 1)
-            a, b = u - np.float32(left), v - np.float32(top)
+            left = np.uint32(np.int32(u))
+            top = np.uint32(np.int32(v))
+            right = np.uint32(left + 1)
+            bottom = np.uint32(top + 1)
+            a = u - np.float32(left)
+            b = v - np.float32(top)
             over = np.float32(image[top, left]) * (one - a) + np.float32(image[top, right]) * a
             under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
             value = min(value, over * (one - b) + under * b)

@@ -9,7 +9,9 @@ from viewmend.utils.compiled import kernel
 def project_vertices(vertices, P, out):
     """Fill out[:, 0:3] with P [X; 1], in pixels times z, and out[:, 3:5] with the pixel coordinates, in float64."""
     for i in range(vertices.shape[0]):
-        x, y, z = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
+        x = np.float64(vertices[i, 0])
+        y = np.float64(vertices[i, 1])
+        z = np.float64(vertices[i, 2])
         for row in range(3):
             out[i, row] = P[row, 0] * x + P[row, 1] * y + P[row, 2] * z + P[row, 3]
         w = out[i, 2] if out[i, 2] > 0 else np.inf
@@ -26,9 +28,14 @@ def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, tr
     `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
     """
     for f in range(faces.shape[0]):
-        a, b, c = projected[faces[f, 0]], projected[faces[f, 1]], projected[faces[f, 2]]
+        a = projected[faces[f, 0]]
+        b = projected[faces[f, 1]]
+        c = projected[faces[f, 2]]
         nearest = min(a[2], b[2], c[2])
-        left, right, top, bottom = 0, width - 1, first_row, end_row - 1
+        left = 0
+        right = width - 1
+        top = first_row
+        bottom = end_row - 1
         if nearest > near:
             left = max(left, np.int64(np.ceil(max(min(a[3], b[3], c[3]) - 0.5, -1.0))))
             right = min(right, np.int64(np.floor(min(max(a[3], b[3], c[3]) - 0.5, 1e6))))
@@ -38,19 +45,29 @@ def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, tr
                 continue
         elif max(a[2], b[2], c[2]) <= near:
             continue
-        ax, ay, aw = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+        ax = b[1] * c[2] - b[2] * c[1]
+        ay = b[2] * c[0] - b[0] * c[2]
+        aw = b[0] * c[1] - b[1] * c[0]
         determinant = a[0] * ax + a[1] * ay + a[2] * aw
         if determinant == 0 or determinant * cull > 0:
             continue
-        bx, by, bw = c[1] * a[2] - c[2] * a[1], c[2] * a[0] - c[0] * a[2], c[0] * a[1] - c[1] * a[0]
-        cx, cy, cw = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        bx = c[1] * a[2] - c[2] * a[1]
+        by = c[2] * a[0] - c[0] * a[2]
+        bw = c[0] * a[1] - c[1] * a[0]
+        cx = a[1] * b[2] - a[2] * b[1]
+        cy = a[2] * b[0] - a[0] * b[2]
+        cw = a[0] * b[1] - a[1] * b[0]
         sign = 1.0 if determinant > 0 else -1.0
         for row in range(top, bottom + 1):
             v = row + 0.5
-            a0, b0, c0 = ay * v + aw, by * v + bw, cy * v + cw
+            a0 = ay * v + aw
+            b0 = by * v + bw
+            c0 = cy * v + cw
             for column in range(left, right + 1):
                 u = column + 0.5
-                ea, eb, ec = ax * u + a0, bx * u + b0, cx * u + c0
+                ea = ax * u + a0
+                eb = bx * u + b0
+                ec = cx * u + c0
                 if ea * sign >= 0 and eb * sign >= 0 and ec * sign >= 0:
                     inverse = np.float32((ea + eb + ec) / determinant)
                     if inverse * near < 1 and inverse > depth[row, column]:
@@ -73,13 +90,18 @@ def interpolate_band(attributes, vertices, faces, P, triangle, first_row, end_ro
             face = triangle[row, column]
             if face < 0:
                 continue
-            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            u, v = column + 0.5, row + 0.5
+            a = faces[face, 0]
+            b = faces[face, 1]
+            c = faces[face, 2]
+            u = column + 0.5
+            v = row + 0.5
             # The corners relative to the pixel's ray: then an edge's value is one 2x2 determinant.
             ax, ay = _beside(vertices, a, P, u, v)
             bx, by = _beside(vertices, b, P, u, v)
             cx, cy = _beside(vertices, c, P, u, v)
-            wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+            wa = bx * cy - by * cx
+            wb = cx * ay - cy * ax
+            wc = ax * by - ay * bx
             scale = 1 / (wa + wb + wc)
             for channel in range(image.shape[2]):
                 value = wa * attributes[a, channel] + wb * attributes[b, channel] + wc * attributes[c, channel]
@@ -89,7 +111,9 @@ def interpolate_band(attributes, vertices, faces, P, triangle, first_row, end_ro
 @kernel
 def _beside(vertices, n, P, u, v):
     """Pixel offsets of a vertex from (u, v), times its depth."""
-    x, y, z = vertices[n, 0], vertices[n, 1], vertices[n, 2]
+    x = vertices[n, 0]
+    y = vertices[n, 1]
+    z = vertices[n, 2]
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     across = P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]
     down = P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]

@@ -27,11 +27,14 @@ def place_crossings(values, iso, vertices, vertex_of_edge):
     """Where the surface crosses the grid's edges, in voxels: all edges along x first, then y, then z."""
     count = 0
     for axis in range(3):
-        dx, dy, dz = int(axis == 0), int(axis == 1), int(axis == 2)
+        dx = int(axis == 0)
+        dy = int(axis == 1)
+        dz = int(axis == 2)
         for x in range(values.shape[0] - dx):
             for y in range(values.shape[1] - dy):
                 for z in range(values.shape[2] - dz):
-                    near, far = values[x, y, z], values[x + dx, y + dy, z + dz]
+                    near = values[x, y, z]
+                    far = values[x + dx, y + dy, z + dz]
                     if (near > iso) != (far > iso):
                         along = (np.float32(iso) - near) / (far - near)
                         vertices[count, 0] = x + dx * along
@@ -68,10 +71,18 @@ def connect(values, iso, table, edge_starts, vertex_of_edge, faces):
 def sum_face_normals(vertices, faces, normals):
     """Add each face's normal, as long as twice its area, to its corners, and make the sums unit vectors."""
     for f in range(faces.shape[0]):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        a = vertices[faces[f, 0]]
+        b = vertices[faces[f, 1]]
+        c = vertices[faces[f, 2]]
+        ux = b[0] - a[0]
+        uy = b[1] - a[1]
+        uz = b[2] - a[2]
+        vx = c[0] - a[0]
+        vy = c[1] - a[1]
+        vz = c[2] - a[2]
+        nx = uy * vz - uz * vy
+        ny = uz * vx - ux * vz
+        nz = ux * vy - uy * vx
         for corner in range(3):
             at = faces[f, corner]
             normals[at, 0] += nx

@@ -260,7 +260,8 @@ def _carve_cpu(
     from viewmend.geometry import _hull_numba as kernels
 
     views, height, width = mask.shape
-    rows, columns = -(-height // pool), -(-width // pool)
+    rows = -(-height // pool)
+    columns = -(-width // pool)
     P, lens, size, low = kernel_arrays(cameras, voxels)
     masks = mask.numpy()
     soft = np.empty((views, rows + 1, columns + 1), np.uint8)
@@ -380,10 +381,12 @@ def soften(
     Beyond each image's own size its border continues.
     """
     views, height, width = mask.shape
-    rows, columns = -(-height // pool), -(-width // pool)
+    rows = -(-height // pool)
+    columns = -(-width // pool)
     y = torch.arange(rows * pool, device=mask.device).clamp(max=height - 1)
     x = torch.arange(columns * pool, device=mask.device).clamp(max=width - 1)
-    own_y, own_x = y.minimum(size_px[:, 1:] - 1), x.minimum(size_px[:, :1] - 1)
+    own_y = y.minimum(size_px[:, 1:] - 1)
+    own_x = x.minimum(size_px[:, :1] - 1)
     view = torch.arange(views, device=mask.device)[:, None, None]
     full = mask[view, own_y[:, :, None], own_x[:, None, :]].float()
     sums = full.view(views, rows, pool, columns, pool).sum((2, 4))

@@ -89,7 +89,8 @@ class LinesOfSight:
         """
         width, height = cameras.max_size_px
         distances = np.full((len(cameras), height, width), -1.0, np.float32)
-        views, found = [], []
+        views = []
+        found = []
         for view, (w, h) in enumerate(cameras.size_px.tolist()):
             outline = _find_outline(mask[view, :h, :w].contiguous().cpu().numpy(), points)
             if outline is not None:

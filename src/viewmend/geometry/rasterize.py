@@ -192,8 +192,10 @@ def _pixel_boxes(
     corners: Float[Tensor, "view face 3 3"], size_px: Int[Tensor, "view 2"]
 ) -> tuple[Int[Tensor, "view face 2"], Int[Tensor, "view face 2"]]:
     """First and last pixel whose centre may be in each triangle; the whole image for one that crosses z = near."""
-    z, image_end = corners[..., 2:], size_px[:, None].double() - 1
-    uv, behind = corners[..., :2] / torch.where(z > NEAR_M, z, torch.inf), z <= NEAR_M
+    z = corners[..., 2:]
+    image_end = size_px[:, None].double() - 1
+    uv = corners[..., :2] / torch.where(z > NEAR_M, z, torch.inf)
+    behind = z <= NEAR_M
     crossing = behind.any(2) & ~behind.all(2)
     low = torch.where(crossing, 0, uv.amin(2) - 0.5).ceil().clamp(min=0).minimum(image_end + 1)
     high = torch.where(crossing, image_end, uv.amax(2) - 0.5).floor().clamp(min=-1).minimum(image_end)

@@ -83,7 +83,9 @@ def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "edge"]) -> Int[Tenso
     size_x, size_y, size_z = inside.shape
     case = torch.zeros(size_x - 1, size_y - 1, size_z - 1, dtype=torch.uint8, device=inside.device)
     for k in range(8):
-        x, y, z = k & 1, k >> 1 & 1, k >> 2 & 1
+        x = k & 1
+        y = k >> 1 & 1
+        z = k >> 2 & 1
         corner = inside[x : size_x - 1 + x, y : size_y - 1 + y, z : size_z - 1 + z]
         case |= corner.to(torch.uint8) << k
     table, starts = _march_tables(inside.device)

@@ -56,7 +56,8 @@ def heavy_operations() -> Iterator[None]:
 
 @contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
-    before, most = torch.get_num_threads(), getattr(_torch, "most", None)
+    before = torch.get_num_threads()
+    most = getattr(_torch, "most", None)
     _torch.most = _most_threads()
     torch.set_num_threads(count)
     try:

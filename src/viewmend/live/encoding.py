@@ -197,7 +197,8 @@ def encode_frame(
 ) -> tuple[bytes, FrameTimes]:
     """Build the message of a frame, with more `fields` in its header; returns it with the times of all stages."""
     start = time.perf_counter()
-    parts, data = [], []
+    parts = []
+    data = []
     for eye, (completed, extra) in enumerate(result.eyes):
         for mode in look.modes:
             image = draw_mode(completed, mode, look.background or result.background, extra)

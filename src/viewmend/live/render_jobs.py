@@ -114,7 +114,8 @@ def frame_motion(asked: TurntableQuery, points: Float[Tensor, "point 3"], home: 
     """Target and distance (metres) and focal length (pixels) with which all images of a turntable show all points."""
     center = (points.amin(0) + points.amax(0)) / 2
     azimuths = torch.deg2rad(asked.azimuth + asked.arc * torch.linspace(-0.5, 0.5, TURNTABLE_VIEWS)).tolist()
-    elevation_rad, size_px = math.radians(asked.elevation), (asked.width, asked.height)
+    elevation_rad = math.radians(asked.elevation)
+    size_px = (asked.width, asked.height)
     shape = {"radius_m": home.distance_m, "elevation_rad": elevation_rad, "center": center, "up": home.up}
     path = fit_to(orbit(azimuths, size_px, **shape, visible_m=home.distance_m), points)
     return {"target": center.tolist(), "distance": home.distance_m, "f": float(path.K[0, 0, 0])}
@@ -214,7 +215,8 @@ class PathJob(RenderJob[bytes]):
 
     def __init__(self, path: PathBody) -> None:
         super().__init__()
-        self._path, self._times = path, path.times
+        self._path = path
+        self._times = path.times
         self._count = 0
         self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps, threads=1)  # encodes on the render thread
@@ -230,7 +232,8 @@ class PathJob(RenderJob[bytes]):
             return None
         if self._times is None:  # the edge at the start of the job
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
-        pose, index = self._path.poses[self._count], self._times[self._count]
+        pose = self._path.poses[self._count]
+        index = self._times[self._count]
         request = request_view(self._path, pose, index, playback, self._path.stereo_m)
         return None if request is None else replace(request, without=self._path.without)
 

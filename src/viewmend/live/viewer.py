@@ -41,7 +41,8 @@ class Viewer:
         from viewmend.live.server import LiveServer, ServerConfig
         from viewmend.live.service import RenderService
 
-        config, port = ServerConfig(**address), ExitStack()
+        config = ServerConfig(**address)
+        port = ExitStack()
         self._live = LiveServer(RenderService(renderer, source), config)
         self._server = Server(self._live, config)
         self.address = f"{port.enter_context(self._server.bind())}/{token_query(config.token)}"

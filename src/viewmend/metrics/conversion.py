@@ -64,7 +64,8 @@ def i3d_weights(stored: Any) -> Weights:
     for path, unit in _units(stored["params"]).items():
         if path.startswith("Logits"):
             continue
-        name, bias = _unit_name(*path.split("/")), _tensor(unit["BatchNorm_0"]["bias"])
+        name = _unit_name(*path.split("/"))
+        bias = _tensor(unit["BatchNorm_0"]["bias"])
         found[f"{name}.conv3d.weight"] = _kernel(unit["Conv_0"]["kernel"])
         found |= {f"{name}.bn.weight": torch.ones_like(bias), f"{name}.bn.bias": bias}
         for ours, theirs in (("running_mean", "mean"), ("running_var", "var")):
@@ -97,7 +98,8 @@ def get_weights(name: str, archive: Path | None = None) -> Path:
     Raises:
         WeightsError: the download failed, or a file is damaged, another one, or not a pickle of plain arrays.
     """
-    published, known = PUBLISHED[name], known_weights(name)
+    published = PUBLISHED[name]
+    known = known_weights(name)
     target = weight_cache() / known.files[0]
     if target.is_file() and has_published_hash(target, known):
         return target

@@ -50,7 +50,8 @@ def ssim_map(
     the Gaussian window uses population variances and the uniform one (scikit-image) sample variances. Only the part in
     which the images differ is computed: equal windows have an SSIM of exactly 1.
     """
-    size, (height, width) = SSIM_SIZE_PX[window], image.shape[1:]
+    size = SSIM_SIZE_PX[window]
+    height, width = image.shape[1:]
     if min(height, width) < size:
         return None
     found = torch.full((height, width), torch.nan, dtype=torch.float64, device=image.device)
@@ -106,7 +107,8 @@ def warp_error(
 
 def _affected_windows(positions: Tensor, length: int, size: int) -> slice:
     """The range along one axis that is covered by all windows containing one of these positions."""
-    start, stop = max(0, int(positions.min()) - size + 1), min(length, int(positions.max()) + size)
+    start = max(0, int(positions.min()) - size + 1)
+    stop = min(length, int(positions.max()) + size)
     return slice(min(start, length - size), max(stop, size))
 
 
@@ -119,7 +121,8 @@ def _ssim_of_windows(
     variance_x = sample * (square_x - mean_x**2)
     variance_y = sample * (square_y - mean_y**2)
     covariance = sample * (product - mean_x * mean_y)
-    c1, c2 = 0.01**2, 0.03**2
+    c1 = 0.01**2
+    c2 = 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     return (similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean(0)
 

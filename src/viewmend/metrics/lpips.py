@@ -14,8 +14,10 @@ from viewmend.metrics.weights import checked_weights, known_weights
 from viewmend.utils.weight_files import load_weights
 
 Backbone = Literal["alex", "vgg"]
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's mean and deviation of RGB in [0, 1]; equivalent to LPIPS' shift and scale of [-1, 1]."""
+MEAN = (0.485, 0.456, 0.406)
+"""ImageNet's mean of RGB in [0, 1]; equivalent to LPIPS' shift of [-1, 1]."""
+DEVIATION = (0.229, 0.224, 0.225)
+"""ImageNet's standard deviation of RGB in [0, 1]; equivalent to LPIPS' scale of [-1, 1]."""
 TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """The ReLUs whose features are compared."""
 CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
@@ -68,7 +70,8 @@ class Lpips(nn.Module):
         with torch.autocast(image.device.type, enabled=False):
             x = torch.cat([image, truth]).float()
             mean, deviation = x.new_tensor((MEAN, DEVIATION))[:, :, None, None]
-            x, found = (x - mean) / deviation, []
+            x = (x - mean) / deviation
+            found = []
             for index, layer in enumerate(self.features):
                 x = layer(x)
                 if index in TAPS[self.backbone]:

@@ -97,9 +97,11 @@ def frechet_distance(a: Float[Tensor, "_n dim"], b: Float[Tensor, "_m dim"]) -> 
     """
     if min(len(a), len(b)) < 2:
         return None
-    a, b = a.double(), b.double()
+    a = a.double()
+    b = b.double()
     means = a.mean(0), b.mean(0)
-    X, Y = (a - means[0]) / (len(a) - 1) ** 0.5, (b - means[1]) / (len(b) - 1) ** 0.5
+    X = (a - means[0]) / (len(a) - 1) ** 0.5
+    Y = (b - means[1]) / (len(b) - 1) ** 0.5
     cross = torch.linalg.svdvals(X @ Y.T).sum()
     distance = (means[0] - means[1]).square().sum() + X.square().sum() + Y.square().sum() - 2 * cross
     return max(0.0, float(distance))
@@ -114,7 +116,8 @@ class _Unit(nn.Module):
         self.bn = nn.BatchNorm3d(channels, eps=1e-3, momentum=0.01)
 
     def forward(self, x: Tensor) -> Tensor:
-        (kernel, *_), (stride, *_) = self.conv3d.kernel_size, self.conv3d.stride
+        kernel = self.conv3d.kernel_size[0]
+        stride = self.conv3d.stride[0]
         return F.relu(self.bn(self.conv3d(_pad_same(x, (kernel,) * 3, (stride,) * 3))))
 
 
@@ -124,8 +127,10 @@ class _Mixed(nn.Module):
     def __init__(self, before: int, channels: Sequence[int]) -> None:
         super().__init__()
         self.b0 = _Unit(before, channels[0], 1)
-        self.b1a, self.b1b = _Unit(before, channels[1], 1), _Unit(channels[1], channels[2], 3)
-        self.b2a, self.b2b = _Unit(before, channels[3], 1), _Unit(channels[3], channels[4], 3)
+        self.b1a = _Unit(before, channels[1], 1)
+        self.b1b = _Unit(channels[1], channels[2], 3)
+        self.b2a = _Unit(before, channels[3], 1)
+        self.b2b = _Unit(channels[3], channels[4], 3)
         self.b3b = _Unit(before, channels[5], 1)
 
     def forward(self, x: Tensor) -> Tensor:

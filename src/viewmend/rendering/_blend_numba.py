@@ -66,15 +66,21 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
         return 0.0
     u = (P[view, 0, 0] * x + P[view, 0, 1] * y + P[view, 0, 2] * w + P[view, 0, 3]) / z
     v = (P[view, 1, 0] * x + P[view, 1, 1] * y + P[view, 1, 2] * w + P[view, 1, 3]) / z
-    width, height = sizes[view, 0], sizes[view, 1]
+    width = sizes[view, 0]
+    height = sizes[view, 1]
     if not (0 <= u < width and 0 <= v < height):
         return 0.0
 
     per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, tolerance[2])
     nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
-    left, top = floor(u - 0.5), floor(v - 0.5)
-    right_share, bottom_share = u - 0.5 - left, v - 0.5 - top
-    usable, red, green, blue = 0.0, 0.0, 0.0, 0.0
+    left = floor(u - 0.5)
+    top = floor(v - 0.5)
+    right_share = u - 0.5 - left
+    bottom_share = v - 0.5 - top
+    usable = 0.0
+    red = 0.0
+    green = 0.0
+    blue = 0.0
     for tap in range(4):
         row = min(max(int(top) + tap // 2, 0), height - 1)
         column = min(max(int(left) + tap % 2, 0), width - 1)

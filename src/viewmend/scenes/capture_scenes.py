@@ -13,9 +13,9 @@ from typing import Annotated, Literal
 import torch
 from msgspec import Meta, Struct, structs
 
+from viewmend.data.capture_folder import CaptureFolder, open_capture
 from viewmend.data.containers import container_of
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.native_capture import NativeCapture, open_capture
 from viewmend.data.native_format import CALIBRATION
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.geometry.cameras import Cameras
@@ -73,7 +73,8 @@ def capture_set(
     if frames is not None and frames < 1:
         raise ValueError(f"expected --frames of at least 1, got {frames}; omit it for all")
     looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
-    fingerprint, count = _fingerprint(folder, format), min(frames or len(capture.frame_ids), len(capture.frame_ids))
+    fingerprint = _fingerprint(folder, format)
+    count = min(frames or len(capture.frame_ids), len(capture.frame_ids))
     return tuple(
         CaptureScene(
             name=f"{capture.name}-{held}-from-{inputs}",
@@ -216,7 +217,7 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
     return tuple(found)
 
 
-def training_captures(file: Path) -> tuple[tuple[NativeCapture, str], ...]:
+def training_captures(file: Path) -> tuple[tuple[CaptureFolder, str], ...]:
     """The captures of a file that are for training, each with the camera that it leaves out, the truth.
 
     ValueError if it is none, or a capture is absent, cannot be used, or was recalibrated.

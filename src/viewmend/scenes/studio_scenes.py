@@ -29,7 +29,10 @@ RINGS = (12, 8)
 TEMPOS = ("calm", "dance", "fast")
 Q_SEEDS = PROCEDURAL_SEEDS["test"][10000:]
 """Seeds of lights, rig and the part of the motion that is used."""
-FRAMES, SIZE_PX = 10, 512
+FRAMES = 10
+"""This many frames of each scene are scored."""
+SIZE_PX = 512
+"""The longer side of the images, pixels."""
 LONG_FRAMES = 41
 """Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
 TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
@@ -147,7 +150,8 @@ def procedural_set(
     name = "P" if background == "black" else f"P-{background}"
     scenes = []
     for n, seed in enumerate(P_SEEDS):
-        cameras, tempo = RINGS[n % 2], TEMPOS[n % 3]
+        cameras = RINGS[n % 2]
+        tempo = TEMPOS[n % 3]
         config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background)
         scenes.append(_scene(f"{name}-{seed}", name, cameras, tempo, config, tempo=tempo))
     return tuple(scenes)
@@ -171,7 +175,8 @@ def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
     """
     scenes = []
     for n, seed in enumerate(TURN_SEEDS):
-        cameras, (tempo, motion) = TURN_RINGS[n % 2], TURNS[n // 2 % 2]
+        cameras = TURN_RINGS[n % 2]
+        tempo, motion = TURNS[n // 2 % 2]
         config = StudioConfig(seed=seed, cameras=cameras, frames=LONG_FRAMES, size_px=size_px)
         moving = {"tempo": tempo, "motion": motion, "scored_from": LONG_FRAMES - FRAMES}
         scenes.append(_scene(f"P-turn-{seed}", "P-turn", cameras, motion, config, **moving))

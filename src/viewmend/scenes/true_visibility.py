@@ -28,7 +28,8 @@ def backward_flow(
     points = interpolate(before.vertices, now, camera, raster)[0]
     uv, z = project(points.reshape(-1, 3), camera)
     inside = (raster.triangle[0].flatten() >= 0) & in_view(uv, z, camera)[0]
-    uv, z = uv[0], z[0]
+    uv = uv[0]
+    z = z[0]
     column, row = torch.where(inside[:, None], uv, 0.0).long().unbind(-1)
     there = depth_before[row, column]
     seen = inside & (there > 0) & ((z - there).abs() < VISIBLE_M)

@@ -45,7 +45,9 @@ class View(NamedTuple):
 def shade_band(scene, view, first_row, end_row, rgb, mask):
     """Fill rows [first_row, end_row) of one view's rgb (3, h, w) and mask (h, w); see `render.render`."""
     n = view.ids.shape[0] // mask.shape[0]
-    sums, color, at = np.zeros(3, np.float32), np.zeros(3, np.float32), np.zeros(11, np.float32)
+    sums = np.zeros(3, np.float32)
+    color = np.zeros(3, np.float32)
+    at = np.zeros(11, np.float32)
     whole = np.float32(n * n)
     for row in range(first_row, end_row):
         for column in range(mask.shape[1]):
@@ -72,25 +74,38 @@ def shade_band(scene, view, first_row, end_row, rgb, mask):
 @kernel
 def interpolate(scene, projected, face, u, v, at):
     """Fill `at` with a face's vertex columns at a pixel, perspective-correct, and return its level of the texture."""
-    i, j, k = scene.faces[face, 0], scene.faces[face, 1], scene.faces[face, 2]
-    ax, ay, az = projected[i, 0], projected[i, 1], projected[i, 2]
-    bx, by, bz = projected[j, 0], projected[j, 1], projected[j, 2]
-    cx, cy, cz = projected[k, 0], projected[k, 1], projected[k, 2]
+    i = scene.faces[face, 0]
+    j = scene.faces[face, 1]
+    k = scene.faces[face, 2]
+    ax = projected[i, 0]
+    ay = projected[i, 1]
+    az = projected[i, 2]
+    bx = projected[j, 0]
+    by = projected[j, 1]
+    bz = projected[j, 2]
+    cx = projected[k, 0]
+    cy = projected[k, 1]
+    cz = projected[k, 2]
     a = (by * cz - bz * cy) * u + (bz * cx - bx * cz) * v + (bx * cy - by * cx)
     b = (cy * az - cz * ay) * u + (cz * ax - cx * az) * v + (cx * ay - cy * ax)
     c = (ay * bz - az * by) * u + (az * bx - ax * bz) * v + (ax * by - ay * bx)
     total = a + b + c
-    wa, wb, wc = np.float32(a / total), np.float32(b / total), np.float32(c / total)
+    wa = np.float32(a / total)
+    wb = np.float32(b / total)
+    wc = np.float32(c / total)
     vertex = scene.vertex
     for n in range(11):
         at[n] = wa * vertex[i, n] + wb * vertex[j, n] + wc * vertex[k, n]
     if az <= 0 or bz <= 0 or cz <= 0:
         return 0.0
     texture = scene.textures[face]
-    u1, v1 = vertex[j, 3] - vertex[i, 3], vertex[j, 4] - vertex[i, 4]
-    u2, v2 = vertex[k, 3] - vertex[i, 3], vertex[k, 4] - vertex[i, 4]
+    u1 = vertex[j, 3] - vertex[i, 3]
+    v1 = vertex[j, 4] - vertex[i, 4]
+    u2 = vertex[k, 3] - vertex[i, 3]
+    v2 = vertex[k, 4] - vertex[i, 4]
     texels = np.abs(u1 * v2 - v1 * u2) * scene.size[texture, 0, 0] * scene.size[texture, 0, 1]
-    x0, y0 = ax / az, ay / az
+    x0 = ax / az
+    y0 = ay / az
     pixels = np.abs((bx / bz - x0) * (cy / cz - y0) - (by / bz - y0) * (cx / cz - x0))
     # At this level a texel is as large as a pixel.
     level = 0.5 * np.log2(max(texels / max(pixels, 2e-6), 1e-6))
@@ -100,18 +115,23 @@ def interpolate(scene, projected, face, u, v, at):
 @kernel
 def texture_color(scene, texture, u, v, level, out):
     """Fill `out` with the trilinear look-up in one texture's levels, clamped at its edges."""
-    texels, low = scene.texels, int(level)
+    texels = scene.texels
+    low = int(level)
     out[:] = 0
     for step in range(2):
         share = np.float32(level - low) if step == 1 else np.float32(1 - (level - low))
         if share <= 0:
             continue
         at = min(low + step, scene.first.shape[1] - 1)
-        width, height, base = scene.size[texture, at, 0], scene.size[texture, at, 1], scene.first[texture, at]
+        width = scene.size[texture, at, 0]
+        height = scene.size[texture, at, 1]
+        base = scene.first[texture, at]
         x = min(max(u * np.float32(width) - np.float32(0.5), np.float32(0)), np.float32(width - 1))
         y = min(max(v * np.float32(height) - np.float32(0.5), np.float32(0)), np.float32(height - 1))
-        x0, y0 = int(x), int(y)
-        fx, fy = x - np.float32(x0), y - np.float32(y0)
+        x0 = int(x)
+        y0 = int(y)
+        fx = x - np.float32(x0)
+        fy = y - np.float32(y0)
         right = 1 if x0 + 1 < width else 0
         top = base + y0 * width + x0
         bottom = top + (width if y0 + 1 < height else 0)
@@ -124,12 +144,18 @@ def texture_color(scene, texture, u, v, level, out):
 @kernel
 def add_highlights(scene, center, at, out):
     """Add the Blinn-Phong highlights of all lamps to a colour."""
-    ex, ey, ez = center[0] - at[0], center[1] - at[1], center[2] - at[2]
+    ex = center[0] - at[0]
+    ey = center[1] - at[1]
+    ez = center[2] - at[2]
     scale = np.float32(1) / np.sqrt(ex * ex + ey * ey + ez * ez)
-    ex, ey, ez = ex * scale, ey * scale, ez * scale
+    ex = ex * scale
+    ey = ey * scale
+    ez = ez * scale
     length = at[5] * at[5] + at[6] * at[6] + at[7] * at[7]
     for k in range(scene.lamps.shape[0]):
-        hx, hy, hz = ex + scene.lamps[k, 0], ey + scene.lamps[k, 1], ez + scene.lamps[k, 2]
+        hx = ex + scene.lamps[k, 0]
+        hy = ey + scene.lamps[k, 1]
+        hz = ez + scene.lamps[k, 2]
         facing = at[5] * hx + at[6] * hy + at[7] * hz
         if facing <= 0:
             continue
@@ -163,11 +189,15 @@ def encode(linear, steps, guesses):
 @kernel
 def unshadowed(pixels, z, depth, bias, seen):
     """One light of `render.visibility`."""
-    last_row, last_column = depth.shape[0] - 1, depth.shape[1] - 1
+    last_row = depth.shape[0] - 1
+    last_column = depth.shape[1] - 1
     for i in range(z.shape[0]):
-        u, v = pixels[i, 0] - np.float32(0.5), pixels[i, 1] - np.float32(0.5)
-        x, y = int(np.floor(u)), int(np.floor(v))
-        fx, fy = u - x, v - y
+        u = pixels[i, 0] - np.float32(0.5)
+        v = pixels[i, 1] - np.float32(0.5)
+        x = int(np.floor(u))
+        y = int(np.floor(v))
+        fx = u - x
+        fy = v - y
         total = 0.0
         for dy in range(2):
             row = min(max(y + dy, 0), last_row)

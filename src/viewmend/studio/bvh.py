@@ -89,7 +89,8 @@ def _hierarchy(path: Path, text: str) -> list[_Joint]:
                     words = [next(tokens) for _ in range(count)]
                     joints[-1].channels = tuple(word.lower() for word in words)
                     if len(words) != count or not CHANNELS.issuperset(joints[-1].channels):
-                        known, got = ", ".join(sorted(CHANNELS)), " ".join(words)[:80]
+                        known = ", ".join(sorted(CHANNELS))
+                        got = " ".join(words)[:80]
                         raise ValueError(f"expected {count} channels among {known}, got {got}")
     except (IndexError, ValueError, StopIteration) as error:
         reason = f"{error}" or "it is cut short"
@@ -106,7 +107,8 @@ def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
     """Seconds per frame and the table of channel values, (frame, channel)."""
     lines = body.strip().splitlines()
     try:
-        count, step = int(lines[0].split(":")[1]), float(lines[1].split(":")[1])
+        count = int(lines[0].split(":")[1])
+        step = float(lines[1].split(":")[1])
         values = np.array(" ".join(lines[2:]).split(), dtype=np.float64)
     except (IndexError, ValueError) as error:
         expected = f"expected 'Frames:', 'Frame Time:' and numbers ({error})"
@@ -121,7 +123,8 @@ def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
 
 
 def _motion(joints: list[_Joint], step: float, values: np.ndarray) -> Motion:
-    frames, count = len(values), len(joints)
+    frames = len(values)
+    count = len(joints)
     rotations = np.zeros((frames, count, 3, 3))
     rest = np.zeros((count, 3))
     root = np.tile(np.array(joints[0].offset), (frames, 1))
@@ -131,7 +134,9 @@ def _motion(joints: list[_Joint], step: float, values: np.ndarray) -> Motion:
         for channel in joint.channels:
             axis = "xyz".index(channel[0])
             if channel.endswith("rotation"):
-                angle, (a, b) = np.deg2rad(values[:, column]), ((axis + 1) % 3, (axis + 2) % 3)
+                angle = np.deg2rad(values[:, column])
+                a = (axis + 1) % 3
+                b = (axis + 2) % 3
                 turn = np.tile(np.eye(3), (frames, 1, 1))
                 turn[:, a, a] = turn[:, b, b] = np.cos(angle)
                 turn[:, b, a] = np.sin(angle)

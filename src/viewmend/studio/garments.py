@@ -109,9 +109,11 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
 
 def find_garments(character: Character, body: RestBody) -> list[Garments | None]:
     """The cloth of each texture, None where there is none (hair, eyes, bare skin)."""
-    lab, maps = [], []
+    lab = []
+    maps = []
     for n, texture in enumerate(character.rest.textures):
-        width, height = max(1, texture.shape[2] // 2), max(1, texture.shape[1] // 2)
+        width = max(1, texture.shape[2] // 2)
+        height = max(1, texture.shape[1] // 2)
         half = cv2.resize(cv2.merge(list(texture.numpy())), (width, height), interpolation=cv2.INTER_AREA)
         lab.append(cv2.cvtColor(half, cv2.COLOR_RGB2LAB))
         maps.append(_texels(character, body, n, width, height))
@@ -137,7 +139,8 @@ def _skin_hues(
 ) -> Float[np.ndarray, "2 2"] | None:
     """Hues (a and b) of the hands and of the face, None where neither shows; hair and gloves do not count."""
     face = body.joints["Head"][2] + FACE_M if "Head" in body.joints else -np.inf
-    hands, faces = [], []
+    hands = []
+    faces = []
     for image, (limb, place) in zip(lab, maps, strict=True):
         hands.append(image[limb == HANDS][::7, 1:])
         # Wigs hang in front of the head, too: a face is on the texture that has the hands.
@@ -148,12 +151,16 @@ def _skin_hues(
 
 def _is_skin(lab: Image, hues: Float[np.ndarray, "2 2"]) -> Bool[np.ndarray, "height width"]:
     """Texels that look like hands and face (see `SKIN_RAD`)."""
-    angle, chroma = np.arctan2(hues[:, 1], hues[:, 0]), np.linalg.norm(hues, axis=1)
-    red, yellow = angle.min() - SKIN_RAD[0], angle.max() + SKIN_RAD[1]
+    angle = np.arctan2(hues[:, 1], hues[:, 0])
+    chroma = np.linalg.norm(hues, axis=1)
+    red = angle.min() - SKIN_RAD[0]
+    yellow = angle.max() + SKIN_RAD[1]
     # Without an arc tangent for each texel: on the right side of both lines through grey.
-    a, b = lab[..., 1], lab[..., 2]
+    a = lab[..., 1]
+    b = lab[..., 2]
     between = (b * np.cos(red) > a * np.sin(red)) & (b * np.cos(yellow) < a * np.sin(yellow))
-    square, (low, high) = a * a + b * b, np.multiply(SKIN_CHROMA, (chroma.min(), chroma.max()))
+    square = a * a + b * b
+    low, high = np.multiply(SKIN_CHROMA, (chroma.min(), chroma.max()))
     return between & (square > low**2) & (square < high**2)
 
 
@@ -181,7 +188,8 @@ def _nearest(values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "co
 def _garments(
     lab: Image, hues: Float[np.ndarray, "2 2"] | None, limb: Limbs, place: Image, body: RestBody
 ) -> Garments | None:
-    shown, bare = limb >= 0, limb >= HANDS
+    shown = limb >= 0
+    bare = limb >= HANDS
     clothable = (shown & ~bare).astype(np.float32)
     if clothable.sum() < BODY_SHARE * shown.sum():
         return None
@@ -195,7 +203,9 @@ def _garments(
     label = _nearest(color, _centers(color[inside][::23]))
     around, along = _unrolled(limb, place, body)
     below = (limb >= LEGS) | (limb == TRUNK) & (along < float(body.joints["Hips"][1] - body.vertices[:, 1].min()))
-    covers, dress, shoes = [], [], []
+    covers = []
+    dress = []
+    shoes = []
     for n, where in itertools.product(range(label.max() + 1), (~below, below & (limb < FEET), limb == FEET)):
         part = inside & (label == n) & where
         if part.sum() > LEAST_SHARE * inside.sum():
@@ -212,7 +222,8 @@ def _smooth(values: np.ndarray, size: int) -> np.ndarray:
 
 def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
     """Coordinates around and along each limb, as if it were a cylinder."""
-    around, along = np.zeros(limb.shape, np.float32), np.zeros(limb.shape, np.float32)
+    around = np.zeros(limb.shape, np.float32)
+    along = np.zeros(limb.shape, np.float32)
     floor = float(body.vertices[:, 1].min())
     for n, name in enumerate(NAMES[:HANDS]):
         at = limb == n
@@ -268,7 +279,8 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
         image = cv2.merge(list(texture.numpy()))
         seeds: dict[int, int] = {}
         for n, (dress, shoe) in enumerate(zip(garments.dress, garments.shoes, strict=True)):
-            changes, seed = rng.random() < variety, int(rng.integers(2**31))
+            changes = rng.random() < variety
+            seed = int(rng.integers(2**31))
             # The halves of an overall: the second takes the seed of the first.
             seed = seeds[dress] if not shoe and dress in seeds and rng.random() < _ONE_PIECE else seed
             seeds[dress] = seed
@@ -284,7 +296,8 @@ def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -
     half = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     # Half a texture's odd last row or column stays as it is.
     full = tuple(slice(2 * s.start, 2 * s.stop) for s in half)
-    own, size = image[full], tuple(2 * (s.stop - s.start) for s in reversed(half))
+    own = image[full]
+    size = tuple(2 * (s.stop - s.start) for s in reversed(half))
 
     def at_full_size(values: np.ndarray) -> np.ndarray:
         return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
@@ -302,7 +315,9 @@ def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -
 
 def _dyed(own: Image, rng: np.random.Generator) -> Image:
     """Hues turned, colours stronger or paler, lighter or darker, and tinted: what is grey takes a colour, too."""
-    turn, strength, gain = rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 1.2), np.exp(rng.uniform(-0.35, 0.45))
+    turn = rng.uniform(0, 2 * np.pi)
+    strength = rng.uniform(0.4, 1.2)
+    gain = np.exp(rng.uniform(-0.35, 0.45))
     axis = np.full(3, 3**-0.5)
     across = np.cross(np.eye(3), axis)
     rotation = np.cos(turn) * np.eye(3) + np.sin(turn) * across + (1 - np.cos(turn)) * np.outer(axis, axis)
@@ -324,7 +339,8 @@ def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.ran
     column = (garments.around_m[window] + CHART.width_m / 2) * CHART.px_per_m - 0.5
     row = (CHART.height_m - garments.along_m[window]) * CHART.px_per_m - 0.5
     color = cv2.remap(chart, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32) / 255
-    shown, part = garments.shown[window], garments.cover[n][window] > 0
+    shown = garments.shown[window]
+    part = garments.cover[n][window] > 0
     known = (shown & part).astype(np.float32)
     # Wide enough for the margin of any cover (`MARGIN_PX`).
     mean = cv2.blur(color * known[..., None], (13, 13)) / np.maximum(cv2.blur(known, (13, 13)), 1e-4)[..., None]

@@ -52,7 +52,8 @@ class Document:
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         entry = self.entry("bufferViews", index)
-        start, data = _count(entry.get("byteOffset", 0)), self.buffers[_count(entry["buffer"])]
+        start = _count(entry.get("byteOffset", 0))
+        data = self.buffers[_count(entry["buffer"])]
         end = start + _count(entry["byteLength"])
         if end > len(data):
             raise self.fault(f"expected {end} bytes of binary data or more, got {len(data)}: it is cut short")
@@ -63,10 +64,13 @@ class Document:
         entry = self.entry("accessors", index)
         if "sparse" in entry or "bufferView" not in entry:
             raise CaptureError(f"{self.path}: sparse accessors are not supported; export without shape keys")
-        dtype, width = np.dtype(_COMPONENTS[entry["componentType"]]), _WIDTHS[entry["type"]]
-        data, size = self.view(entry["bufferView"]), dtype.itemsize * width
+        dtype = np.dtype(_COMPONENTS[entry["componentType"]])
+        width = _WIDTHS[entry["type"]]
+        data = self.view(entry["bufferView"])
+        size = dtype.itemsize * width
         stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", size))
-        offset, count = _count(entry.get("byteOffset", 0)), _count(entry["count"])
+        offset = _count(entry.get("byteOffset", 0))
+        count = _count(entry["count"])
         if stride < size:
             raise self.fault(f"accessor {index}: expected a byteStride of {size} or more, got {stride}")
         if count and offset + stride * (count - 1) + size > len(data):
@@ -107,7 +111,8 @@ def read_document(path: Path) -> Document:
     if data[:4] == b"glTF":
         text, binary = _chunks(path, data)
     elif path.suffix.lower() == ".gltf":
-        text, binary = data, b""
+        text = data
+        binary = b""
     else:
         raise CaptureError(f"{path}: expected a glTF binary that starts with 'glTF', got {data[:4]!r}; export a .glb")
     try:
@@ -261,7 +266,8 @@ def _node(document: Document, index: int, parent: int) -> Node:
     name = str(entry.get("name", f"node{index}"))
     if "matrix" in entry:
         matrix = torch.tensor(entry["matrix"], dtype=torch.float32).reshape(4, 4).T
-        translation, scale = matrix[:3, 3].clone(), matrix[:3, :3].norm(dim=0)
+        translation = matrix[:3, 3].clone()
+        scale = matrix[:3, :3].norm(dim=0)
         if not bool((scale > 0).all()):
             raise CaptureError(f"{document.path}: node {name} has a singular matrix; apply transforms and export again")
         rotation = matrix[:3, :3] / scale
@@ -299,7 +305,8 @@ class _Parts:
 
     def add(self, node: int, skin: int | None, primitive: Mapping[str, Any]) -> None:
         """Append one primitive of the mesh at `node`."""
-        attributes, read = primitive["attributes"], self.document.accessor
+        attributes = primitive["attributes"]
+        read = self.document.accessor
         vertices = read(attributes["POSITION"]).astype(np.float32)
         n = len(vertices)
         if self.count + n > MAX_VERTICES:

@@ -81,7 +81,8 @@ class GltfPerformer:
 
     def _floor(self) -> float:
         """Height of the floor under the clip: the median of the soles, or their 5th percentile and a little."""
-        count, lows = len(self.motion.root), []
+        count = len(self.motion.root)
+        lows = []
         for n in range(min(FLOOR_SAMPLES, count)):
             matrices = self._body.joint_matrices(float(n * count // min(FLOOR_SAMPLES, count)))
             lows.append(self.character.posed(matrices).mesh.vertices[:, 1].min())

@@ -102,9 +102,11 @@ def imperfect_frame(
     if imperfections == Imperfections():
         return frame
     assert frame.mask is not None, "studio frames always have masks"
-    rgb, mask = [], []
+    rgb = []
+    mask = []
     for n, (width, height) in enumerate(frame.cameras.size_px.tolist()):
-        image, cover = frame.rgb[n, :, :height, :width], frame.mask[n, :height, :width]
+        image = frame.rgb[n, :, :height, :width]
+        cover = frame.mask[n, :height, :width]
         behind = None if background is None else background[n, :, :height, :width]
         seeds = (seed, n if numbers is None else numbers[n], frame.time)
         pad = (0, frame.rgb.shape[3] - width, 0, frame.rgb.shape[2] - height)
@@ -174,7 +176,8 @@ def _stained(rgb: Picture, mask: Mask, background: Backdrop, strength: float) ->
 
 def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
     """Rows and columns that hold all of a mask, and as much around it as a blur reaches."""
-    bounds, margin = [], _reach(sigma_px)
+    bounds = []
+    margin = _reach(sigma_px)
     for along in (1, 0):
         places = (mask > 0).any(along).nonzero().flatten().tolist() or [0]
         bounds.append(slice(max(0, places[0] - margin), places[-1] + 1 + margin))
@@ -184,7 +187,8 @@ def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
 def _mask(mask: Mask, it: Imperfections, seeds: Seeds) -> Mask:
     """Holes and blobs, then an outline that wanders and softens."""
     seed, view, time = seeds
-    generator, value = _generator(seed, 4, view, time), mask.float() / 255
+    generator = _generator(seed, 4, view, time)
+    value = mask.float() / 255
     if it.mask_holes or it.mask_blobs:
         means = torch.tensor([it.mask_holes, it.mask_blobs])
         holes, blobs = torch.poisson(means, generator=generator).int().tolist()
@@ -213,7 +217,8 @@ def _mask(mask: Mask, it: Imperfections, seeds: Seeds) -> Mask:
 def _spot(where: Tensor, generator: torch.Generator) -> Tensor:
     """An ellipse about a random pixel of `where`, 1 to 4 per cent of the image across."""
     height, width = where.shape
-    places, draw = where.nonzero(), torch.rand(4, generator=generator).tolist()
+    places = where.nonzero()
+    draw = torch.rand(4, generator=generator).tolist()
     if not len(places):
         return torch.zeros_like(where)
     row, column = places[int(draw[0] * len(places))].tolist()

@@ -19,8 +19,12 @@ from viewmend.types import MultiViewFrame
 
 _WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
 """Linear light: green screen, grey, dark, white, blue screen."""
-DIRECTIONS, EVENNESS = 16, 0.65
+DIRECTIONS = 16
+"""The light of the surroundings is sampled in this many directions."""
+EVENNESS = 0.65
+"""This share of the light comes from the surroundings, the rest from lamps."""
 SHADOW_PX = 128
+"""Shadow maps have this side, pixels."""
 SHADOW_DISTANCE_M = 12.0
 """Lights are this far away: near enough to be a pinhole camera, far enough to look parallel."""
 SHADOW_BIAS_M = 0.015
@@ -51,7 +55,8 @@ def stage_lights(seed: int) -> Lights:
     generator = torch.Generator().manual_seed(seed)
     # Directions spread evenly over a sphere (a Fibonacci spiral).
     place = torch.arange(DIRECTIONS) + 0.5
-    y, around = 1 - 2 * place / DIRECTIONS, place * math.pi * (3 - math.sqrt(5))
+    y = 1 - 2 * place / DIRECTIONS
+    around = place * math.pi * (3 - math.sqrt(5))
     radius = (1 - y * y).sqrt()
     toward = torch.stack([radius * around.cos(), y, radius * around.sin()], -1)
     surrounding = (0.75 + 0.45 * toward[:, 1:2]).expand(-1, 3)
@@ -76,8 +81,10 @@ def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -
     One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
     """
     # A far camera at each light that holds the whole mesh.
-    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
-    middle, radius = (low + high) / 2, float((high - low).norm()) / 2 + 0.02
+    low = mesh.vertices.amin(0)
+    high = mesh.vertices.amax(0)
+    middle = (low + high) / 2
+    radius = float((high - low).norm()) / 2 + 0.02
     distance = SHADOW_DISTANCE_M + radius
     up, side = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]], device=middle.device)
     poses = [
@@ -156,8 +163,11 @@ def render(
         samples_per_side: 2 gives masks in steps of a quarter.
     """
     fine = _enlarged(cameras, samples_per_side)
-    scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
-    triangle, depth = rasterize(scene.mesh, fine).triangle, rasterize(scene.mesh, cameras).depth
+    scene = surface.scene
+    lights = surface.lights
+    pyramid = surface.pyramid
+    triangle = rasterize(scene.mesh, fine).triangle
+    depth = rasterize(scene.mesh, cameras).depth
     if background is None:
         background = torch.zeros(len(cameras), 3, *depth.shape[1:])
     views, _, height, width = background.shape
@@ -170,7 +180,8 @@ def render(
     seen = [t.contiguous().numpy() for t in (triangle, projected, fine.centers, background)]
     rgb = torch.zeros(views, 3, height, width, dtype=torch.uint8)
     mask = torch.zeros(views, height, width, dtype=torch.uint8)
-    colors, covers = rgb.numpy(), mask.numpy()
+    colors = rgb.numpy()
+    covers = mask.numpy()
 
     def draw(item: int) -> None:
         v, band = divmod(item, BANDS)

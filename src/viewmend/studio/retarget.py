@@ -64,7 +64,8 @@ def family_table(family: str) -> dict[str, str]:
     """Part -> joint name of a known family: acclaim, cgspeed, humanik, mixamo, rigify or mannequin."""
     joined, pattern, replacement = _FAMILIES[family]
     left = joined.split()
-    trunk, sided = left[: len(TRUNK)], left[len(TRUNK) :]
+    trunk = left[: len(TRUNK)]
+    sided = left[len(TRUNK) :]
     right = [re.sub(pattern, replacement, name) for name in sided]
     return dict(zip(PARTS, [*trunk, *sided, *right], strict=True))
 
@@ -208,7 +209,8 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     for place, part in enumerate(parts):
         driver[node_of[part]] = place
     # s (p + G_root o_b) - G_root o_a, scaled by leg length: the middle of the hip joints moves as the actor's.
-    hips, hips_turn = _joint_path(motion, joint_of["Hips"]) @ turn.T, rotations[:, joint_of["Hips"]]
+    hips = _joint_path(motion, joint_of["Hips"]) @ turn.T
+    hips_turn = rotations[:, joint_of["Hips"]]
     scale = _leg_length(own) / _leg_length(actor)
     path = scale * (hips + hips_turn @ _hip_middle(actor)) - hips_turn @ _hip_middle(own)
     return Retarget(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path)
@@ -245,7 +247,8 @@ def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
     """The turn by right angles that brings a rest pose to y up and its left side to +x."""
 
     def nearest_axis(v: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-        axis, n = torch.zeros(3), int(v.abs().argmax())
+        axis = torch.zeros(3)
+        n = int(v.abs().argmax())
         axis[n] = v[n].sign()
         return axis
 
@@ -259,7 +262,8 @@ def _alignment(part: str, own: Rest, actor: Rest) -> Float[Tensor, "3 3"]:
     """A_j: the smallest rotation from the character's bone direction at rest to the motion's."""
     side = "Left" if part.startswith("Left") else "Right"
     limb = "ForeArm" if part == side + "Hand" else part.removeprefix(side)
-    start, end = side + limb, side + _LIMBS.get(limb, "")
+    start = side + limb
+    end = side + _LIMBS.get(limb, "")
     if not all(p in own and p in actor for p in (start, end)):
         return torch.eye(3)
     a, b = ((rest[end] - rest[start]) / (rest[end] - rest[start]).norm() for rest in (own, actor))

@@ -65,7 +65,8 @@ def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_
         >>> orbit([0.0, 0.5], (320, 240)).names
         ('orbit000', 'orbit001')
     """
-    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
+    center = torch.tensor(SUBJECT_CENTER_M)
+    up = torch.tensor(UP)
     shown = {"radius_m": RADIUS_M, "elevation_rad": elevation_rad, "visible_m": VISIBLE_M}
     return orbit_of(azimuths_rad, size_px, center=center, up=up, **shown)
 
@@ -73,7 +74,8 @@ def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_
 def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], seed: int) -> Cameras:
     """Cameras at about `eyes` that look at about the subject's centre."""
     off = torch.randn(len(eyes), 3, 3, generator=torch.Generator().manual_seed(seed))
-    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
+    center = torch.tensor(SUBJECT_CENTER_M)
+    up = torch.tensor(UP)
     views = []
     for n, eye in enumerate(eyes):
         eye = eye + 0.04 * off[n, 0]

@@ -181,7 +181,8 @@ class Studio:
 
     def _surface(self, time: int) -> Surface:
         if self._last_surface is None or self._last_surface[0] != time:
-            scene, pyramid = self.scene(time), self._last_pyramid
+            scene = self.scene(time)
+            pyramid = self._last_pyramid
             if pyramid is None or [*map(id, pyramid[0])] != [*map(id, scene.textures)]:
                 pyramid = self._last_pyramid = scene.textures, texture_pyramid(scene.textures)
             self._last_surface = time, light(scene, self._lights, pyramid[1])

@@ -41,7 +41,8 @@ class Discriminator(nn.Module):
                 253 with 6.
         """
         super().__init__()
-        C, last = (3, *(width * 2 ** min(layer, 2) for layer in range(layers))), layers - 1
+        C = (3, *(width * 2 ** min(layer, 2) for layer in range(layers)))
+        last = layers - 1
         if kind == "image":
             convolutions = [nn.Conv2d(C[i], C[i + 1], 5, 2, 2, bias=i == last) for i in range(layers)]
         else:
@@ -133,7 +134,9 @@ class Adversary:
 
     def __init__(self, net: Discriminator, loss: AdversarialLoss, weight: float, learning_rate: float) -> None:
         """`weight` is lambda_adv, the weight of the loss in the model's total."""
-        self.discriminator, self.loss, self.weight = net, loss, weight
+        self.discriminator = net
+        self.loss = loss
+        self.weight = weight
         self.optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=learning_rate, betas=BETAS)
 
     def losses(self, batch: Judged, share: float) -> tuple[Float[Tensor, ""], float]:

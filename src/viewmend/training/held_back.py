@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from viewmend.data.capture_folder import CaptureFolder
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_image
-from viewmend.data.native_capture import NativeCapture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.frame_cache import CachedFrame
@@ -61,7 +61,8 @@ class HeldBack:
         Raises:
             CaptureError: there is no such camera, or too few others.
         """
-        names, count = capture.cameras.names, len(capture.frame_ids)
+        names = capture.cameras.names
+        count = len(capture.frame_ids)
         first_frame = count - math.ceil(TAIL * count) if count > 1 else 1
         if camera is None:
             return cls(None, first_frame)
@@ -80,7 +81,7 @@ class HeldBack:
 class TrainingCapture:
     """A capture to train on."""
 
-    source: NativeCapture
+    source: CaptureFolder
     left_out: str | None
     """The one camera that is the ground truth; None for all in turn."""
     held_back: HeldBack | None
@@ -119,7 +120,8 @@ class HeldBackView:
         stream = Stream(model, StreamConfig(memory_mb=None, background=background))
         stream.add_frame(*to_device((self.inputs.frame, self.inputs.proxy), device))
         completed = to_device(stream.view(self.truth.cameras.to(device)).completed, "cpu")
-        rgb, truth = composite(background, completed.rgb, completed.opacity), camera_image(self.truth, background)
+        rgb = composite(background, completed.rgb, completed.opacity)
+        truth = camera_image(self.truth, background)
         found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
         assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
         box = _subject_box(self.truth.mask[0])
@@ -146,7 +148,8 @@ def _subject_box(mask: Tensor) -> tuple[slice, slice]:
         own = (mask > 127).any(1 - axis).nonzero()[:, 0]
         first, last = (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
         short = max(0, MIN_PX["alex"] - (last - first))
-        first, last = first - (short + 1) // 2, last + (short + 1) // 2
+        first = first - (short + 1) // 2
+        last = last + (short + 1) // 2
         first, last = (0, last - first) if first < 0 else (first, last)
         box.append(slice(max(0, first - (last - length)), length) if last > length else slice(first, last))
     return box[0], box[1]
@@ -164,8 +167,9 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
         yield from _views_of(opened.source, opened.held_back, table)
 
 
-def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[HeldBackView]:
-    names, count = capture.cameras.names, len(capture.frame_ids)
+def _views_of(capture: CaptureFolder, own: HeldBack, table: bool) -> Iterator[HeldBackView]:
+    names = capture.cameras.names
+    count = len(capture.frame_ids)
     late = range(own.first_frame, count) if count > 1 else range(1)
     if table:
         others = [name for name in names if name != own.camera]
@@ -190,7 +194,7 @@ def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[He
         yield HeldBackView(camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth)
 
 
-def _time_with_subject(capture: NativeCapture, late: range) -> int:
+def _time_with_subject(capture: CaptureFolder, late: range) -> int:
     """The frame nearest to the middle of those held back that has a subject, or else the last one before them.
 
     Without any, the middle one.
@@ -234,10 +238,12 @@ class HeldBackValidation:
 
 def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:
     """A Markdown table of the scores before and after fine-tuning by camera; writes the views as a contact sheet."""
-    metric, rows = load_lpips("alex"), []
+    metric = load_lpips("alex")
+    rows = []
     lines = ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |"]
     for view in held_back_views(place, hold_out, table=True):
-        (old, old_view), (new, new_view) = view.score(before, metric), view.score(after, metric)
+        old, old_view = view.score(before, metric)
+        new, new_view = view.score(after, metric)
         note = " (its image was trained on)" if view.trained_on else ""
         lines.append(
             f"| {view.camera}{note} | {old.psnr_db:.2f} | {new.psnr_db:.2f} | {old.lpips:.4f} | {new.lpips:.4f} |"

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,11 +33,19 @@ from viewmend.utils.atomic_writes import write_atomically
 from viewmend.utils.output_folder import OutputFolder
 from viewmend.utils.tensors import to_device
 
-WRITTEN = (
-    *("model.safetensors", "config.json", "README.md", "log.jsonl"),
-    *("comparison.png", "validation-*.png", "not-finite-*", "tensorboard"),
+WRITTEN_FILES = (
+    "model.safetensors",
+    "config.json",
+    "README.md",
+    "log.jsonl",
+    "comparison.png",
+    "validation-*.png",
 )
-"""Files and folders that a run writes, apart from its checkpoints."""
+"""A run writes these files, apart from its checkpoints."""
+WRITTEN_FOLDERS = ("not-finite-*", "tensorboard")
+"""A run writes these folders."""
+LOSSES = ("inside", "outside", "total", "adversarial", "discriminator")
+"""The losses of a step are logged under these names."""
 
 
 def train(
@@ -81,8 +89,9 @@ def _claim(out: Path) -> Iterator[None]:
     """Lock the folder for this run; ValueError if another run writes there, or it has other files and no checkpoint."""
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
-            folder.check_own_files(*WRITTEN)
-        folder.made(FILE, PREVIOUS, *WRITTEN, *(f"{pattern}/*" for pattern in WRITTEN[-2:]), changing=True)
+            folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
+        in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
+        folder.made(FILE, PREVIOUS, *WRITTEN_FILES, *WRITTEN_FOLDERS, *in_folders, changing=True)
         yield
 
 
@@ -137,7 +146,8 @@ class Processes:
 def join_processes() -> Iterator[Processes]:
     """Join the other processes if torchrun started this one, and leave when all are done."""
     count = int(os.environ.get("WORLD_SIZE", "1"))
-    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
+    rank = int(os.environ.get("RANK", "0"))
+    local = int(os.environ.get("LOCAL_RANK", "0"))
     device = torch.device("cuda", local) if torch.cuda.is_available() else torch.device("cpu")
     if count == 1:
         yield Processes(0, 1, device)
@@ -153,14 +163,17 @@ def join_processes() -> Iterator[Processes]:
         torch.distributed.destroy_process_group()
 
 
-class Clock:
+class RunClock:
     """The times of a run: how far it is, how fast, and when the next checkpoint is due."""
 
     def __init__(self, config: TrainConfig, step: int, elapsed_s: float) -> None:
         """`step` steps were done before, in `elapsed_s`."""
-        self.config, self.first_step, self.before_s = config, step, elapsed_s
+        self.config = config
+        self.first_step = step
+        self.before_s = elapsed_s
         self._began = self._saved = time.monotonic()
-        self._samples, self._waited_s = 0, 0.0
+        self._samples = 0
+        self._waited_s = 0.0
 
     def elapsed_s(self) -> float:
         """Seconds that the run has taken, including its earlier parts."""
@@ -207,11 +220,11 @@ class Run:
         torch.manual_seed(config.seed)
         if start is None and config.start is not None:
             start = config.objective.load_start(config.start)
-        self.config, self.out, self.own = config, out, own
-        here = config
-        if config.precision == "auto":  # not stored: a run may be resumed on another machine
-            here = replace(config, precision="bfloat16" if faster_dtype(own.device) == torch.bfloat16 else "float32")
-        self.objective = config.objective.objective(here, config.objective, start).to(own.device)
+        self.config = config
+        self.out = out
+        self.own = own
+        options = config.objective
+        self.objective = options.objective(_with_precision(config, own.device), options, start).to(own.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
@@ -224,9 +237,10 @@ class Run:
         if self.adversary is not None:
             self._modules["discriminator"] = self.adversary.discriminator.to(own.device)
             self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
-        if last := last_checkpoint(out):
+        last = last_checkpoint(out)
+        if last:
             self.state = load_run(last, config, self._modules, self._optimizers)
-        self.shared = own.wrap_ddp(self.objective)
+        self.ddp_objective = own.wrap_ddp(self.objective)
         self.streams = self._make_streams()
         self.validation = self.objective.validation if config.validate_every and own.first else None
         self.keeps_best = bool(config.scenes.hold_out and config.scenes.captures and config.validate_every)
@@ -235,7 +249,8 @@ class Run:
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
-        config, clock = self.config, Clock(self.config, self.state.step, self.state.elapsed_s)
+        config = self.config
+        clock = RunClock(self.config, self.state.step, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
             step = first = self.state.step
             if step == 0 and self.validation is not None and (self.keeps_best or self.objective.compares_seen):
@@ -283,7 +298,8 @@ class Run:
         scores |= {"parted": seen_minus_unseen(scores, first)} if "holes_seen" in scores else {}
         log.add_validation(step, scores)
         self.validated = scores
-        score, best = scores.get("score"), self.state.best_score
+        score = scores.get("score")
+        best = self.state.best_score
         if self.keeps_best and score is not None and (best is None or score >= best + MIN_GAIN_DB):
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(step)
@@ -296,43 +312,61 @@ class Run:
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
         self.optimizer.zero_grad(set_to_none=True)
-        losses, done, count = [], 0, sum(map(len, batches))
+        losses = []
+        done = 0
+        count = sum(map(len, batches))
         for number, batch in enumerate(batches):
             # Random numbers depend on the stream and the step, not on the process that computes them.
             stream = number * self.own.count + self.own.rank
             torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
             for piece in self._split(batch):
-                share, done = len(piece) / count, done + len(piece)
+                share = len(piece) / count
+                done += len(piece)
                 # Gradients accumulate here; they meet those of other processes in the last backward pass.
-                with self.shared.no_sync() if isinstance(self.shared, Ddp) and done < count else nullcontext():
-                    terms = self._add_gradients(step, [to_device(sample, self.own.device) for sample in piece], share)
-                losses.append(share * torch.tensor(terms, device=self.own.device))
+                is_last = done == count
+                with nullcontext() if is_last else self._without_sync():
+                    samples = [to_device(sample, self.own.device) for sample in piece]
+                    terms = self._add_gradients(step, samples, share)
+                values = torch.tensor([terms[name] for name in LOSSES], device=self.own.device)
+                losses.append(share * values)
         torch.nn.utils.clip_grad_norm_(self.trained, self.objective.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
             self.adversary.step(self.own.mean)
         means = self.own.mean(torch.stack(losses).sum(0)).tolist()
-        return dict(zip(("inside", "outside", "total", "adversarial", "discriminator"), means, strict=True))
+        return dict(zip(LOSSES, means, strict=True))
+
+    def _without_sync(self) -> AbstractContextManager[None]:
+        """A context in which gradients are not averaged over the processes."""
+        return self.ddp_objective.no_sync() if isinstance(self.ddp_objective, Ddp) else nullcontext()
 
     def _split(self, batch: list[object]) -> list[list[object]]:
         """Parts of a batch of at most `microbatch` samples."""
         size = self.config.microbatch or len(batch)
         return [batch[first : first + size] for first in range(0, len(batch), size)]
 
-    def _add_gradients(self, step: int, samples: list[object], share: float) -> list[float]:
-        """Add the gradients of these samples' loss times `share`; returns the terms of the loss."""
-        output = self.shared(samples)
+    def _add_gradients(self, step: int, samples: list[object], share: float) -> dict[str, float]:
+        """Add the gradients of these samples' loss times `share`; returns the terms of the loss, named as `LOSSES`."""
+        output = self.ddp_objective(samples)
         assert isinstance(output, StepOutput)
-        total, adversarial, discriminator = output.total, 0.0, 0.0
+        total = output.total
+        adversarial = 0.0
+        discriminator = 0.0
         if self.adversary is not None:
             assert output.judged is not None, "objectives with an adversary return what it judges"
             term, discriminator = self.adversary.losses(output.judged, share)
-            total, adversarial = total + self.adversary.weight * term, float(term.detach())
+            total = total + self.adversary.weight * term
+            adversarial = float(term.detach())
         self._check_finite(total.detach(), step, samples)
         (total * share).backward()
-        image = [float(term.detach()) for term in (output.image.inside, output.image.outside, total)]
-        return [*image, adversarial, discriminator]
+        return {
+            "inside": float(output.image.inside.detach()),
+            "outside": float(output.image.outside.detach()),
+            "total": float(total.detach()),
+            "adversarial": adversarial,
+            "discriminator": discriminator,
+        }
 
     def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
         if torch.isfinite(total):
@@ -349,7 +383,8 @@ class Run:
 
     def _make_streams(self) -> list[SampleReplay[object]]:
         """The streams of this process: numbers rank, rank + count and so on."""
-        config, own = self.config, self.own
+        config = self.config
+        own = self.own
         count = max(config.streams, own.count)
         if count % own.count:
             raise ValueError(
@@ -368,7 +403,7 @@ class Run:
             streams.append(SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, at))
         return streams
 
-    def _save(self, step: int, clock: Clock) -> None:
+    def _save(self, step: int, clock: RunClock) -> None:
         positions = self.own.gather([stream.position for stream in self.streams])
         self.state = replace(self.state, step=step, elapsed_s=clock.elapsed_s(), positions=positions)
         if self.own.first:
@@ -389,11 +424,22 @@ def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, fl
     """
     gains = []
     for name in ("holes_seen", "holes"):
-        now, before = scores.get(name), first.get(name)
+        now = scores.get(name)
+        before = first.get(name)
         if now is None or before is None:
             return None
         gains.append(now - before)
     return gains[0] - gains[1]
+
+
+def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
+    """The config with `auto` as the precision that suits the device.
+
+    It is not stored, because a run may be resumed on another machine.
+    """
+    if config.precision != "auto":
+        return config
+    return replace(config, precision="bfloat16" if faster_dtype(device) == torch.bfloat16 else "float32")
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:

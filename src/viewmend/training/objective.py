@@ -95,7 +95,8 @@ class Objective(nn.Module, Generic[Model]):
             CaptureError, ShardError, WeightsError: the data cannot be used.
             ValueError: data reserved for tests is requested.
         """
-        options, shards = self.config.objective, self.config.shards
+        options = self.config.objective
+        shards = self.config.shards
         if shards is None:
             return options.make_scenes(self.config.scenes, seed)
         return ShardScenes(shards, seed, options.item, options.whole_shards, options.sampling.clip_length)
@@ -121,7 +122,8 @@ def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", option
     """
     if start is None:
         return
-    own, found = model.state_dict(), start.state_dict()
+    own = model.state_dict()
+    found = start.state_dict()
     own = {name: weight for name, weight in own.items() if not (kept and name.startswith(kept))}
     fitting = {name: found[name] for name, weight in own.items() if name in found and found[name].shape == weight.shape}
     missing = [name for name in own if name not in fitting and not (optional and name.startswith(optional))]

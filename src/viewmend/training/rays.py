@@ -71,7 +71,8 @@ class RayBatch:
 
     def inputs(self) -> RayInputs:
         """The inputs of `RayFill`."""
-        window, neighbourhoods = self.window.float() / 255, self.neighbourhoods.float() / 255
+        window = self.window.float() / 255
+        neighbourhoods = self.neighbourhoods.float() / 255
         masks = self.smallest_masks.float()
         return RayInputs(self.features.float(), masks, window, neighbourhoods, self.neighbourhood_index)
 

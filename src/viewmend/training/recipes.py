@@ -132,7 +132,8 @@ def finetune(start: str = "views") -> TrainConfig:
         sampling = replace(PaperObjectiveConfig().sampling, min_history=0)  # captures may be short
         objective = PaperObjectiveConfig(model=model, sampling=sampling, adversarial=0.0)
     else:
-        config, objective = rays(), RaysObjectiveConfig(model=model)
+        config = rays()
+        objective = RaysObjectiveConfig(model=model)
     return replace(
         config,
         name="finetune",

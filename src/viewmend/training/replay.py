@@ -49,7 +49,8 @@ class SampleReplay(Generic[Item]):
     ) -> None:
         """Begin at the first scene, or resume at `start`, whose buffered samples are made again."""
         start = start or ReplayPosition(0, 0, 0)
-        self.seed, self.new_per_batch = seed, new_per_batch
+        self.seed = seed
+        self.new_per_batch = new_per_batch
         self._new = islice(samples_in_order(scenes, start.scene, workers), start.sample, None)
         self._buffer = deque(islice(self._new, start.buffered), maxlen=max(1, replay_size))
 
@@ -122,7 +123,8 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
             gc.unfreeze()
     else:
         loaded = (numbered[number] for number in count(first))
-    empty, samples = 0, None
+    empty = 0
+    samples = None
     try:
         for number, samples in loaded:
             if isinstance(samples, Exception):

@@ -16,8 +16,10 @@ from viewmend.training.replay import ReplayPosition
 from viewmend.utils.atomic_writes import TEMPORARY, name_path_in_errors, write_tensors, write_text
 from viewmend.utils.untrusted_input import InputError
 
-FILE, PREVIOUS = "run.safetensors", "run.previous.safetensors"
-"""The last checkpoint and the one before it."""
+FILE = "run.safetensors"
+"""The last checkpoint has this name."""
+PREVIOUS = "run.previous.safetensors"
+"""The checkpoint before the last has this name."""
 MAY_CHANGE = ("steps", "minutes", "workers", "microbatch", "checkpoint_minutes", "validate_every", "validation_views")
 """Fields of the config that may differ when a run is resumed."""
 
@@ -90,7 +92,8 @@ def load_run(
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        stored, own = json.loads(metadata["config"]), _flat(config)
+        stored = json.loads(metadata["config"])
+        own = _flat(config)
         values = json.loads(metadata["state"])
         different = [key for key in {**own, **stored} if key not in MAY_CHANGE and own.get(key) != stored.get(key)]
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:

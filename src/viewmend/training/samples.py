@@ -116,7 +116,8 @@ def rig_samples(
         protocol = scenes.protocols[0] if len(scenes.protocols) == 1 else random.choice(scenes.protocols)
         others = HeldOutCamera(rig, held, HullConfig(resolution=scenes.hull_resolution), protocol)
         for end in random.sample(ends, min(sampling.num_target_frames, len(ends))):
-            render, sample = RenderConfig(cameras=draw_source_views(sampling, random)), None
+            render = RenderConfig(cameras=draw_source_views(sampling, random))
+            sample = None
             for time in range(end - sampling.clip_length + 1, end + 1):
                 context = tuple(t for t in reversed(times) if t <= time) if sampling.with_context else ()
                 new = others.sample(time, context, render, sampling, sampling.min_hole_px if time == end else 0)

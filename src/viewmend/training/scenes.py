@@ -16,8 +16,10 @@ from viewmend.training.held_back import HeldBack, open_training_captures
 from viewmend.training.samples import Sample, rig_samples
 from viewmend.types import MultiViewFrame
 
-HARD_CALIBRATION, HARD_MASKS = 4.0, 2.0
-"""Largest factors of the calibration and silhouette errors of hard scenes."""
+HARD_CALIBRATION = 4.0
+"""Hard scenes have calibration errors of at most this many times the usual size."""
+HARD_MASKS = 2.0
+"""Hard scenes have silhouette errors of at most this many times the usual size."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,8 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
         ),
     )
     if config.hard_fraction and random.random() < config.hard_fraction:
-        it, factor = studio.imperfections, random.uniform(1, HARD_CALIBRATION)
+        it = studio.imperfections
+        factor = random.uniform(1, HARD_CALIBRATION)
         it = replace(it, calibration_px=factor * it.calibration_px, calibration_m=factor * it.calibration_m)
         it = replace(it, mask_edge_px=random.uniform(1, HARD_MASKS) * it.mask_edge_px)
         studio = replace(studio, imperfections=it)
@@ -196,9 +199,11 @@ class SampleScenes:
 
     def scene(self, number: int) -> list[Sample]:
         """The samples of rig `number`, for some held-out cameras at some frames."""
-        rigs, sampling = self.rigs, self.sampling
+        rigs = self.rigs
+        sampling = self.sampling
         if self.single_frames is not None and Random(f"window/{number}").random() >= sampling.window_fraction:
-            rigs, sampling = self.single_frames, replace(sampling, min_history=0)
+            rigs = self.single_frames
+            sampling = replace(sampling, min_history=0)
         scene = rigs.rig(number)
         return rig_samples(scene.rig, self.config, sampling, scene.random, scene.held_out)
 

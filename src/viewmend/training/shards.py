@@ -28,8 +28,10 @@ KINDS: dict[str, type] = {
     kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds)
 }
 """The dataclasses that files may hold, by name; `storable` adds to them."""
-COMPRESSION, MAX_BYTES = 1, 2**31
-"""Level at which items are compressed by zlib, and their largest accepted size: most pixels of an item are black."""
+COMPRESSION = 1
+"""Items are compressed by zlib at this level: most of their pixels are black."""
+MAX_BYTES = 2**31
+"""Items have at most this many bytes without compression."""
 STRUCTURE = "structure"
 """Name of the tensor that holds everything but the tensors, as JSON."""
 Kind = TypeVar("Kind")
@@ -115,7 +117,9 @@ class ShardScenes(Generic[Kind]):
         """
         self.paths = shards_of(folder)
         self.seed = seed
-        self.kind, self.whole, self.clip_length = kind, whole, clip_length
+        self.kind = kind
+        self.whole = whole
+        self.clip_length = clip_length
         if not self.paths:
             raise ShardError(f"{folder}: expected tar files, found none; write some with `viewmend make-dataset --out`")
         self._items = 1 if whole else len(read_shard(self.paths[0]))
@@ -196,7 +200,8 @@ def _hints(kind: type) -> dict[str, Any]:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Whether a field's value has the type of its annotation."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
     if origin is tuple:

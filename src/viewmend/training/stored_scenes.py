@@ -98,7 +98,8 @@ class StoredScene:
         _check(view.truth, view.truth.cameras)
         depth = None if self.depth is None else _upsampled(self.depth.metres(), self.frame)
         frame = replace(self.frame, cameras=view.cameras, depth=depth)
-        others, target = replace(frame, depth=None).without([view.name]), view.cameras.select([view.name])
+        others = replace(frame, depth=None).without([view.name])
+        target = view.cameras.select([view.name])
         true_depth = None if view.depth is None else view.depth.metres()[0]
         if errors is None or depth is None or true_depth is None:
             stream = Stream(Unfilled(), StreamConfig(render=render, memory_mb=None))
@@ -129,7 +130,8 @@ def _check(frame: MultiViewFrame, cameras: Cameras) -> None:
 
 def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
     """The first frame of a rig, with `num_holdout_views` of its cameras held out in turn."""
-    rig, time = scene.rig, min(scene.rig.frames)
+    rig = scene.rig
+    time = min(scene.rig.frames)
     frame = rig.frames[time]
     names = [name for name in frame.cameras.names if scene.held_out in (None, name)]
     held = scene.random.sample(names, min(config.num_holdout_views, len(names)))
@@ -139,9 +141,11 @@ def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
 
 
 def _store_view(scene: Scene, name: str, time: int, hull: HullConfig) -> StoredView:
-    proxy, truth = HeldOutCamera(scene.rig, name, hull).frame(time).proxy, scene.rig.truth(name, time)
+    proxy = HeldOutCamera(scene.rig, name, hull).frame(time).proxy
+    truth = scene.rig.truth(name, time)
     assert isinstance(proxy, GeometryProxy), "the proxy of a held-out camera is a hull"
-    mesh, bounds = proxy.mesh, proxy.bounds
+    mesh = proxy.mesh
+    bounds = proxy.bounds
     vertices = (STEPS * (mesh.vertices - bounds.low) / bounds.size_m).round().clamp(0, STEPS).to(torch.uint16)
     indices = mesh.faces.flatten().int()
     return StoredView(
@@ -199,7 +203,8 @@ class StoredSamples:
 
     def scene(self, number: int) -> list[Sample]:
         """All views of scene `number`."""
-        random, samples = Random(f"{self.seed}/views/{number}"), []
+        random = Random(f"{self.seed}/views/{number}")
+        samples = []
         for stored in self.scenes.scene(number):
             for view in range(len(stored.held)):
                 render = RenderConfig(cameras=draw_source_views(self.sampling, random), error_rule="all")

@@ -52,17 +52,24 @@ MIN_SUBJECT_PX = 200
 """Views of a smaller subject are skipped."""
 MIN_VIEWS = 3
 """Smallest number of cameras after some were removed at random."""
-FEWER_VIEWS, SPARSE, RECOLOURED, SMOOTH_GUESS = 0.6, 0.3, 0.7, 0.3
-"""Fractions of crops with fewer cameras, of crops whose pixels are only partly predicted, of views with changed
-colours, and of views whose holes are guessed from their surroundings only."""
+FEWER_VIEWS = 0.6
+"""This fraction of the crops has fewer cameras."""
+SPARSE = 0.3
+"""This fraction of the crops has some pixels that are not predicted."""
+RECOLOURED = 0.7
+"""This fraction of the views has changed colours."""
+SMOOTH_GUESS = 0.3
+"""This fraction of the views has holes that are guessed from their surroundings only."""
 MIN_GAIN = 0.6
 """Smallest factor by which changed colours are darkened."""
 WRONG = 0.08
 """Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when crops are drawn."""
 CORRECT = 0.1
 """Largest difference of a channel with which a pixel counts as correct for confidence and error prediction."""
-RIGHT, DAMAGED = 0.05, 0.08
-"""Largest difference of a channel with which a rendered pixel is right, and from which a changed one is penalised."""
+RIGHT = 0.05
+"""A rendered pixel is right if no channel, in [0, 1], differs from the truth by more than this."""
+DAMAGED = 0.08
+"""A change to a right pixel is penalised from this difference of a channel on."""
 VISIBLE = 0.02
 """A camera sees a point if its true depth there differs by less, in subject sizes."""
 GAIN_WEIGHT = 4.0
@@ -146,11 +153,16 @@ class TrainingView:
     def of(cls, sample: Sample, net: ViewSynthNet, smooth_guess: bool = False) -> "TrainingView":
         """The view of a sample with alpha and `ray_views`; holes are guessed by `net`, or from their surroundings."""
         assert sample.ray_views and sample.alpha is not None, "stored scenes have both"
-        view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
-        scale, sources = SceneScale.of(view), SourceCameras.of(sample.ray_views, view.silhouettes)
+        view = sample.view
+        truth = sample.truth
+        alpha = sample.alpha
+        depth = sample.depth
+        scale = SceneScale.of(view)
+        sources = SourceCameras.of(sample.ray_views, view.silhouettes)
         crop = subject_crop(view, MARGIN_PX)
         view = crop.of_view(view)
-        truth, alpha = crop.of_image(truth).contiguous(), crop.of_image(alpha).contiguous()
+        truth = crop.of_image(truth).contiguous()
+        alpha = crop.of_image(alpha).contiguous()
         depth = None if depth is None else crop.of_image(depth).contiguous()
         return cls(view, sources, scale, net.coarse_guess(view, sources, smooth_guess), truth, alpha, depth)
 
@@ -187,7 +199,8 @@ class TrainingViews:
 def recolour(sample: Sample, random: Random) -> Sample:
     """The sample with permuted colour channels, darkened by a random factor."""
     assert sample.ray_views is not None, "stored scenes have cameras"
-    channels, gain = random.sample(range(3), 3), random.uniform(MIN_GAIN, 1)
+    channels = random.sample(range(3), 3)
+    gain = random.uniform(MIN_GAIN, 1)
     frame = sample.ray_views.frame
     images = frame.rgb[:, channels], sample.truth[channels]
     rgb, truth = ((gain * image.float()).round().to(torch.uint8) for image in images)
@@ -240,7 +253,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
     def __init__(self, config: TrainConfig, options: "ViewsObjectiveConfig", start: nn.Module | None) -> None:
         super().__init__(config, initial_model(options, config.precision))
         load_start(self.model, start, kept="coarse.", optional="errors.")
-        self.options, self.weights = options, options.loss
+        self.options = options
+        self.weights = options.loss
         # In a tuple: it is neither trained nor part of checkpoints.
         self._perceptual = (load_lpips("alex"),) if options.loss.perceptual else ()
         self.validation = ViewsValidation(config, options)
@@ -266,8 +280,10 @@ class ViewsObjective(Objective[ViewSynthNet]):
     def _terms(self, crop: TrainingView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The weighted sum, L1 in the holes, L1 of all pixels, and the logarithmic error."""
         made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.guess)
-        at, weights = tuple(made.pixels.T), self.weights
-        truth, alpha = crop.truth / 255, crop.alpha[at] / 255
+        at = tuple(made.pixels.T)
+        weights = self.weights
+        truth = crop.truth / 255
+        alpha = crop.alpha[at] / 255
         off = made.rgb - truth[:, at[0], at[1]].T
         hole = crop.view.holes[at].float()
         weight = 1 + weights.holes * hole
@@ -291,7 +307,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
         truth = crop.truth / 255
         if not self._perceptual or min(truth.shape[1:]) < MIN_PX["alex"]:
             return truth.new_zeros(())
-        at, image = tuple(made.pixels.T), truth.clone()
+        at = tuple(made.pixels.T)
+        image = truth.clone()
         image[:, at[0], at[1]] = made.rgb.T.float()
         return self._perceptual[0].to(truth.device)(image[None], truth[None])[0]
 
@@ -303,7 +320,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
             return off.new_zeros(())
         at = tuple(made.pixels.T)
         found = self.model.errors(crop.view, crop.sources, crop.scale)
-        rendered, predicted = crop.view.rgb[:, *at].T, made.rgb.detach()
+        rendered = crop.view.rgb[:, *at].T
+        predicted = made.rgb.detach()
         wrong = ((rendered - (predicted - off.detach())).abs().amax(1) > CORRECT).float()
         alpha = found.alpha[at]
         gain, rest = ((k * rendered - predicted).square().mean(1) for k in (1.0, alpha.detach()[:, None]))
@@ -313,7 +331,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
 
     def _cell_terms(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
         """The terms of cells: their mean colour and, where true depth is available, depth and visibility."""
-        distribution, weights = made.distribution, self.weights
+        distribution = made.distribution
+        weights = self.weights
         cells = tuple(distribution.cells.T)
         shares = distribution.logits.softmax(1)[..., None]
         truth = F.avg_pool2d(crop.truth[None] / 255, CELL_PX, ceil_mode=True)[0, :, cells[0], cells[1]].T
@@ -370,11 +389,14 @@ class ViewsObjectiveConfig(ObjectiveConfig):
 def _gradient_loss(made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size) -> Float[Tensor, ""]:
     """Mean difference between the errors of neighbouring predicted pixels."""
     image = scatter_to_image(F.pad(off, (0, 1), value=1.0), made.pixels, shape)
-    total, number = image.new_zeros(()), image.new_zeros(())
+    total = image.new_zeros(())
+    number = image.new_zeros(())
     for axis in (1, 2):
-        one, other = image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, 0, image.shape[axis] - 1)
+        one = image.narrow(axis, 1, image.shape[axis] - 1)
+        other = image.narrow(axis, 0, image.shape[axis] - 1)
         both = one[3] * other[3]
-        total, number = total + (both * (one[:3] - other[:3]).abs().mean(0)).sum(), number + both.sum()
+        total = total + (both * (one[:3] - other[:3]).abs().mean(0)).sum()
+        number = number + both.sum()
     return total / number.clamp_min(1)
 
 
@@ -426,13 +448,16 @@ class ViewsValidation:
             views = (view for number in count() for view in source.scene(number))
             self._views = list(islice(views, self.config.validation_views))
         device = next(model.parameters()).device
-        scores, rows = [], []
+        scores = []
+        rows = []
         for own in self._views:
             own = to_device(own, device)
-            view, truth = own.view, own.truth / 255
+            view = own.view
+            truth = own.truth / 255
             made = model(view, own.sources, own.scale, guess=own.guess)
             rgb = scatter_to_image(made.rgb, made.pixels, view.mask.shape)
-            subject, holes = own.alpha > 127, (view.mask > 0) & (view.weights.sum(0) == 0)
+            subject = own.alpha > 127
+            holes = (view.mask > 0) & (view.weights.sum(0) == 0)
             row = {"rendered": _psnr(view.rgb, truth), "completed": _psnr(rgb, truth)}
             row |= {"subject": _psnr(rgb, truth, subject), "holes": _psnr(rgb, truth, holes)}
             if model.errors is not None:

@@ -28,7 +28,8 @@ def kernel(function: Any = None, *, cache: bool = True, **options: Any) -> Any:
     except RuntimeError:  # numba found no folder that it can write to
         if folder := _private_folder():
             config: Any = numba.config
-            before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+            before = config.CACHE_DIR
+            config.CACHE_DIR = str(folder)
             with suppress(RuntimeError):
                 compiled.enable_caching()
             config.CACHE_DIR = before

@@ -44,7 +44,8 @@ def contact_sheet(
     tallest = max((round(tile_width * i.shape[0] / i.shape[1]) for i in images), default=tile_width)
     box = tile_width, tallest if tile_height is None else tile_height
     columns = max((len(row) for row in rows), default=0)
-    step_x, step_y = box[0] + GAP_PX, box[1] + LABEL_PX + GAP_PX
+    step_x = box[0] + GAP_PX
+    step_y = box[1] + LABEL_PX + GAP_PX
     sheet = np.full((len(rows) * step_y + GAP_PX, columns * step_x + GAP_PX, 3), BACKGROUND, np.uint8)
     for y, row in enumerate(rows):
         for x, tile in enumerate(row):
@@ -61,7 +62,8 @@ def _place(sheet: np.ndarray, tile: Tile, corner: tuple[int, int], box: tuple[in
     import cv2
 
     left, top = corner
-    font, grey = cv2.FONT_HERSHEY_SIMPLEX, (220, 220, 220)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    grey = (220, 220, 220)
     text = tile.label.encode("ascii", "replace").decode()
     (wide, _), _ = cv2.getTextSize(text, font, 0.5, 1)
     scale = 0.5 * min(1.0, (box[0] - 4) / max(wide, 1))
@@ -72,5 +74,6 @@ def _place(sheet: np.ndarray, tile: Tile, corner: tuple[int, int], box: tuple[in
     zoom = min(box[0] / width, box[1] / height)
     size = max(1, min(box[0], round(width * zoom))), max(1, min(box[1], round(height * zoom)))
     scaled = cv2.resize(tile.image, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST)
-    x, y = left + (box[0] - size[0]) // 2, top + LABEL_PX
+    x = left + (box[0] - size[0]) // 2
+    y = top + LABEL_PX
     sheet[y : y + size[1], x : x + size[0]] = scaled

@@ -12,8 +12,10 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-IDLE_S, BUSY_S = 5.0, 20.0
-"""Minimum seconds from one trim to the next, while no view is requested and while some are."""
+IDLE_S = 5.0
+"""Trims are at least this many seconds apart while no view is requested."""
+BUSY_S = 20.0
+"""Trims are at least this many seconds apart while views are requested."""
 MIN_GROWTH_BYTES = 10e6
 """Smaller growth is not trimmed: to return 100 MB takes 10 ms, and to allocate them again takes longer."""
 TOP_BYTES = 50_000_000
@@ -25,7 +27,9 @@ LARGE_BYTES = 8_000_000
 threshold up to 32 MB."""
 KERNELS = 64
 """Compiled convolutions that oneDNN keeps, each for one size of image. By default 1024, which fill 150 MB and more."""
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
+_M_ARENA_MAX = -8
 
 
 @cache
@@ -80,10 +84,12 @@ class HeapTrimmer:
         if now - self._trimmed_at < (IDLE_S if idle else BUSY_S):
             return False
         self._trimmed_at = now
-        library, resident = _glibc(), resident_bytes()
+        library = _glibc()
+        resident = resident_bytes()
         if library is None or resident is None:
             return False
-        grew_before, self._grew = self._grew, resident - self._baseline_bytes >= MIN_GROWTH_BYTES
+        grew_before = self._grew
+        self._grew = resident - self._baseline_bytes >= MIN_GROWTH_BYTES
         if not (self._grew or grew_before):
             return False
         gc.collect()  # closed connections are reference cycles, which Python collects after 100,000 more objects

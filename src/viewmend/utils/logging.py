@@ -12,7 +12,8 @@ def printable(text: str) -> str:
 
 def escaped_traceback(error: BaseException) -> str:
     """Format a traceback with each error message escaped onto a single line."""
-    ours, lines = ("File ", "Traceback ", "The above exception ", "During handling "), []
+    ours = ("File ", "Traceback ", "The above exception ", "During handling ")
+    lines = []
     for part in traceback.TracebackException.from_exception(error).format():
         whole = part.strip("\n")
         lines += whole.split("\n") if whole.lstrip(" |+-").startswith(ours) else [whole]

@@ -29,7 +29,8 @@ class Stored:
     """An array or a dtype; its state follows in the pickle."""
 
     def __init__(self, dtype: np.dtype | None = None, value: Any = None) -> None:
-        self.dtype, self.value = dtype, value
+        self.dtype = dtype
+        self.value = value
 
     def __setstate__(self, state: Any) -> None:
         if self.dtype is None:
@@ -75,7 +76,9 @@ def numbers(value: Any, *shape: int) -> np.ndarray:
     Raises:
         ValueError: it has other values, or another number of them.
     """
-    count, found, pending = int(np.prod(shape)), [], [value]
+    count = int(np.prod(shape))
+    found = []
+    pending = [value]
     for _ in range(MAX_STEPS):
         if not pending or len(found) > count:
             break

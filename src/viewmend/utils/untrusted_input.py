@@ -128,7 +128,8 @@ def _explained(error: str, value: Any, kind: Any, next_step: str) -> str:
     place, got = _follow(value, path)
     text = error
     if missing := re.fullmatch(r"Object missing required field `(.*)`", error):
-        place, text = f"{place}{missing[1]}: ", "expected a value, got nothing"
+        place = f"{place}{missing[1]}: "
+        text = "expected a value, got nothing"
         next_step = "add the key"
     elif unknown := re.fullmatch(r"Object contains unknown field `(.*)`", error):
         text = f"expected keys among {', '.join(kind.__struct_fields__)}, got '{unknown[1][:40]}'"

@@ -43,7 +43,9 @@ def load_weights(network: Network, path: str | Path, device: torch.device | str 
         DamagedWeightsError: the file is missing, unreadable or truncated.
         MismatchedWeightsError: a tensor is missing, unknown, of another shape or dtype, or not finite.
     """
-    path, weights, own = Path(path), read_weights(path), network.state_dict()
+    weights = read_weights(path)
+    path = Path(path)
+    own = network.state_dict()
     both = {key: (value, own[key]) for key, value in sorted(weights.items()) if key in own}
     wrong = {
         "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),

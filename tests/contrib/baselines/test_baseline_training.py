@@ -23,7 +23,7 @@ from viewmend.contrib.baselines.training import (
 )
 from viewmend.training.adversarial import HINGE
 from viewmend.training.config import TrainConfig
-from viewmend.training.loop import Clock, Run, join_processes, train
+from viewmend.training.loop import Run, RunClock, join_processes, train
 from viewmend.training.recipes import make_recipe
 from viewmend.training.samples import Sample
 from viewmend.training.shards import write_shards
@@ -168,8 +168,8 @@ def test_positional_maps_are_trained_in_parts(network, kind, size, clip_of_two):
 @pytest.mark.slow
 def test_a_network_is_trained_resumed_and_usable_as_a_method(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(Clock, "checkpoint_due", lambda self: calls.append(0) or len(calls) == 2)
-    monkeypatch.setattr(Clock, "saved", lambda self: calls.clear())
+    monkeypatch.setattr(RunClock, "checkpoint_due", lambda self: calls.append(0) or len(calls) == 2)
+    monkeypatch.setattr(RunClock, "saved", lambda self: calls.clear())
     clips = studio_samples("tests", clip_length=2)
     list(write_shards((s for number in range(3) for s in clips.scene(number)), tmp_path / "shards", shard_size=2))
     config = config_of(shards=tmp_path / "shards", validate_every=3, validation_views=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from viewmend.contrib.live_rig.aligner import MAX_COMPLETE, Aligner, TimedImages
-from viewmend.data.native_capture import CameraImages
+from viewmend.data.camera_images import CameraImages
 
 IMAGES = CameraImages(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.uint8), None)
 FRAME_S = 0.1

@@ -111,7 +111,9 @@ class Rgvi(Inpainter):
         """Fills from the past along flow, the rest from the view alone; `context` is not used."""
         assert isinstance(state, RgviState), "the state of another inpainter"
         past = state.past if not state.past or state.past[0].shape == view.rgb.shape else ()
-        image, left, subject = view.rgb, view.error > 0, view.mask > 0
+        image = view.rgb
+        left = view.error > 0
+        subject = view.mask > 0
         if bool(left.any()) and past:
             image, left = self._pull(view, past, state.flows)
         if bool(left.any()):
@@ -128,7 +130,8 @@ class Rgvi(Inpainter):
         self, view: IncompleteView, past: tuple[Image, ...], flows: tuple[FlowMap, ...]
     ) -> tuple[Image, Bool[Tensor, "height width"]]:
         """The view with masked pixels from the latest past frame that shows them, and the pixels that none shows."""
-        missing, subject = view.error > 0, view.mask > 0
+        missing = view.error > 0
+        subject = view.mask > 0
         # Flow needs colours in the holes; flow estimated there, and close by, is replaced.
         guess = fill(view.rgb, missing, subject)
         size = 2 * FLOW_MARGIN_PX + 1
@@ -136,14 +139,18 @@ class Rgvi(Inpainter):
         flow = self.flow(guess, past[0])
         unknown = near | disagreeing(flow, self.flow(past[0], guess))
         flow = fill(flow, unknown, subject)
-        image, left, seen = view.rgb, missing, torch.ones_like(missing)
+        image = view.rgb
+        left = missing
+        seen = torch.ones_like(missing)
         for age, frame in enumerate(past):
             if age:
                 older, inside = pull(flows[age - 1], flow)
-                flow, seen = flow + older, seen & inside
+                flow = flow + older
+                seen = seen & inside
             pulled, inside = pull(frame, flow)
             found = left & seen & inside
-            image, left = torch.where(found, pulled, image), left & ~found
+            image = torch.where(found, pulled, image)
+            left = left & ~found
         return image, left
 
     def _remember(self, image: Image, past: tuple[Image, ...], flows: tuple[FlowMap, ...]) -> RgviState:

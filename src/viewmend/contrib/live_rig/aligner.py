@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from viewmend.data.native_capture import CameraImages
+from viewmend.data.camera_images import CameraImages
 
 ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""

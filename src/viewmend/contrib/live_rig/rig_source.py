@@ -13,7 +13,8 @@ from viewmend.contrib.live_rig.aligner import Aligner, ImageGroup, TimedImages
 from viewmend.contrib.live_rig.frame_readers import Picture, Playback, read_pictures
 from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
 from viewmend.contrib.live_rig.worker import CameraWorker
-from viewmend.data.native_capture import CameraImages, pinhole_cameras, stack_images
+from viewmend.data.camera_images import CameraImages, stack_images
+from viewmend.data.capture_folder import pinhole_cameras
 from viewmend.data.prepare import PreparedCapture, prepare
 from viewmend.data.source import MemoryCapture
 from viewmend.data.video_clock import video_track

@@ -12,8 +12,9 @@ import numpy as np
 
 from viewmend.contrib.live_rig.frame_readers import Picture
 from viewmend.contrib.live_rig.rig_file import LiveCamera
+from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_capture import CameraImages, Undistortion
+from viewmend.data.undistortion import Undistortion
 from viewmend.data.videos import is_turned, to_rgb
 from viewmend.preprocess.masks.maker import MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks

@@ -23,8 +23,16 @@ from viewmend.utils.contact_sheet import Tile, contact_sheet, in_rows, picture
 
 Point = Float[Tensor, "3"]
 Picture = UInt8[np.ndarray, "height width 3"]
-MASK_ONLY, HULL_ONLY = (255, 0, 255), (0, 255, 255)
-BOX, AXES, UP = (255, 255, 255), {"x": (255, 60, 60), "y": (60, 255, 60), "z": (90, 120, 255)}, (255, 220, 0)
+MASK_ONLY = (255, 0, 255)
+"""Pixels of the mask outside the hull have this colour, magenta."""
+HULL_ONLY = (0, 255, 255)
+"""Pixels of the hull outside the mask have this colour, cyan."""
+BOX = (255, 255, 255)
+"""The edges of the bounds have this colour, white."""
+AXES = {"x": (255, 60, 60), "y": (60, 255, 60), "z": (90, 120, 255)}
+"""The axes have these colours: red, green and blue."""
+UP = (255, 220, 0)
+"""The line that points up has this colour, yellow."""
 LEGEND = (
     "white: bounds; red x, green y, blue z; yellow: up; magenta: mask without hull; cyan: hull without mask; "
     "with a good calibration and good masks both are thin seams"
@@ -89,7 +97,8 @@ def _draw(check: CalibrationCheck, view: int, up: Point | None) -> Picture:
 
 def _lines(check: CalibrationCheck, up: Point | None) -> Iterator[tuple[Point, Point, tuple[int, int, int], str]]:
     """The edges of the bounds, and axes and up at the centre of the subject: both ends, colour and label."""
-    low, high = check.bounds.low, check.bounds.high
+    low = check.bounds.low
+    high = check.bounds.high
     for axis in range(3):
         for corner in range(4):
             bits = torch.tensor([corner & 1, corner >> 1])

@@ -1,6 +1,7 @@
 """Finds cameras whose images do not show the same surface as the others', or have another sharpness."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,25 +17,52 @@ from viewmend.geometry.sampling import sample_bilinear
 from viewmend.types import MultiViewFrame
 
 LONGEST_PX = 256
+"""Images are compared at no more than this many pixels along their longer side."""
 BLANK_PX = 128
-"""Every n-th pixel is looked at, so that at least this many remain along the longer side."""
+"""Blank images are looked for in every n-th pixel, so that at least this many remain along the longer side."""
 HULL = HullConfig(resolution=64)
-FAR, FAR_AT_LEAST = 2.5, 0.09
-"""An image shows something else if its colour distance to the others is this many times the median, and at least the
-second value: where colours agree to 2 %, shadows and noise alone make a distance of three times as much."""
-FARTHER, LESS_ALIKE, MANY = 1.55, 0.72, 5
-"""It also does at this lower ratio if its best correlation is below this share of the median, in rigs of at least
-this number of cameras: medians of fewer say little."""
-SUSPECT, FITS = 1.25, 0.65
-"""From this ratio on, mirrored, rotated, BGR and other cameras' images are tried. One that reduces the distance to this
-share is the explanation."""
-PALE, COLOURFUL = 0.4, 0.05
-"""An image is grey if its saturation is below this share of the median, which must be at least the second value."""
-FLAT, DARK = 0.05, 1.0
-"""An image shows nothing if its pixel differences are below this share of the median, or its mean is below the
-second value."""
-BLURRED, NOISY = 0.45, 2.0
-"""Ratio of pixel differences to the median: below the first an image is blurred, above the second noisy."""
+"""Hulls have this resolution."""
+
+
+@dataclass(frozen=True)
+class OtherSubjectRule:
+    """The rule by which an image shows something other than the images of the other cameras.
+
+    The distance is the difference in colour to the others. Where colours agree to 2 %, shadows and noise alone make it
+    three times as large, hence `min_distance`.
+    """
+
+    min_distance: float = 0.09
+    """The distance is larger than this."""
+    ratio: float = 2.5
+    """It is also larger than this many times the median; or the following three conditions hold."""
+    lower_ratio: float = 1.55
+    """The distance is larger than this many times the median."""
+    max_correlation: float = 0.72
+    """The best correlation with the others is below this share of the median."""
+    min_cameras: int = 5
+    """The rig has at least this many cameras: medians of fewer say little."""
+
+
+OTHER_SUBJECT = OtherSubjectRule()
+"""The rule that is used."""
+SUSPECT = 1.25
+"""Changed images are tried for a camera whose distance is more than this many times the median: mirrored, rotated, BGR,
+and those of other cameras."""
+FITS = 0.65
+"""A changed image explains the fault if its distance is below this share of the original's."""
+PALE = 0.4
+"""An image is grey if its saturation is below this share of the median."""
+COLOURFUL = 0.05
+"""Grey images are looked for if the median saturation is above this."""
+FLAT = 0.05
+"""An image shows nothing if its pixel differences are below this share of the median."""
+DARK = 1.0
+"""An image shows nothing if its mean is below this value of 255, unless the median is, too."""
+BLURRED = 0.45
+"""An image is blurred if its pixel differences are below this many times the median."""
+NOISY = 2.0
+"""An image is noisy if its pixel differences are above this many times the median."""
 
 
 def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
@@ -49,14 +77,19 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
         return ()
     colours = surface.colours(small.rgb)
     distance, correlation = best_agreement(colours)
-    typical, alike = distance.nanmedian(), correlation.nanmedian()
+    typical = distance.nanmedian()
+    alike = correlation.nanmedian()
     suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
     better = _find_better_fits(small, surface, colours, distance, suspects)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
-    farther = (distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike)
-    far = ((distance > FAR * typical) | (farther & (len(distance) >= MANY))) & (distance > FAR_AT_LEAST)
-    blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
-    mismatch, texts = "its images do not match those of the other cameras", {}
+    rule = OTHER_SUBJECT
+    farther = (distance > rule.lower_ratio * typical) & (correlation < rule.max_correlation * alike)
+    enough = len(distance) >= rule.min_cameras
+    far = ((distance > rule.ratio * typical) | (farther & enough)) & (distance > rule.min_distance)
+    blurred = detail < BLURRED * detail.nanmedian()
+    noisy = detail > NOISY * detail.nanmedian()
+    mismatch = "its images do not match those of the other cameras"
+    texts = {}
     for view in range(len(small.cameras)):
         if bool(grey[view]):
             texts[view] = "its images are grey, but the others' are not; check its settings"
@@ -94,7 +127,8 @@ def _find_better_fits(
     suspects: Sequence[int],
 ) -> dict[int, str]:
     """The suspects whose images match the others much better when changed, or as another camera's; and how."""
-    found, names = {}, frame.cameras.names
+    found = {}
+    names = frame.cameras.names
     for view in suspects:
         width, height = (int(side) for side in frame.cameras.size_px[view])
         own = frame.rgb[view, :, :height, :width]
@@ -122,8 +156,10 @@ def _measures(
 
     Saturation is the difference of the colour channels, relative to brightness.
     """
-    rgb, inside = images.float(), masks > FOREGROUND
-    grey, both = rgb.mean(1), inside[:, :, 1:] & inside[:, :, :-1]
+    rgb = images.float()
+    inside = masks > FOREGROUND
+    grey = rgb.mean(1)
+    both = inside[:, :, 1:] & inside[:, :, :-1]
     total = (grey * inside).sum((1, 2))
     detail = ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
     return total / inside.sum((1, 2)), detail, ((rgb.amax(1) - rgb.amin(1)) * inside).sum((1, 2)) / total

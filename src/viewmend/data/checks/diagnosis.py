@@ -34,15 +34,19 @@ LONGEST_PX = 384
 MAX_CAMERAS_FOR_SWAPS = 24
 """In larger rigs swapped pairs are not searched, since each pair needs a hull."""
 PAIRS_PX = 192
+"""Swapped pairs are searched in images of at most this many pixels along their longer side."""
 PAIRS_HULL = HullConfig(resolution=48)
+"""Hulls of swapped pairs have this resolution."""
 MIN_CAMERA_IOU = 0.5
 """A camera below this IoU is faulty, however well the others agree."""
-MIN_SIZE_M, MAX_SIZE_M = 0.05, 20.0
-"""Subjects outside this range usually have the wrong unit."""
+MIN_SIZE_M = 0.05
+"""Subjects smaller than this, metres, usually have the wrong unit."""
+MAX_SIZE_M = 20.0
+"""Subjects larger than this, metres, usually have the wrong unit."""
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-"""Between OpenGL's and OpenCV's camera axes."""
+"""This matrix converts between OpenGL's and OpenCV's camera axes."""
 TURNED = {"mirrored": (1,), "upside down": (0,), "rotated by 180 degrees": (0, 1)}
-"""How masks may lie, and the axes to flip."""
+"""Masks may be turned in these ways; each needs these axes flipped."""
 
 
 def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue, ...]:
@@ -74,10 +78,12 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue
 
 def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
     """The camera that is inconsistent with the others, by the hull, unless the outlines point to another camera."""
-    by_hull, by_outlines = find_outlier_by_hull(frame, bounds), find_outlier_by_outlines(frame, bounds)
+    by_hull = find_outlier_by_hull(frame, bounds)
+    by_outlines = find_outlier_by_outlines(frame, bounds)
     if by_outlines is None or (by_hull and any(f"'{name}'" in by_hull[0].text for name in by_outlines[0])):
         return by_hull
-    names, factor = " or ".join(f"'{name}'" for name in by_outlines[0]), by_outlines[1]
+    names = " or ".join(f"'{name}'" for name in by_outlines[0])
+    factor = by_outlines[1]
     text = f"without camera {names} the outlines of the other cameras agree {factor:.2g} times better"
     return (Issue(f"{text}; check its calibration, its mask and its synchronisation", timing=True),)
 
@@ -211,7 +217,8 @@ def _turned(frame: MultiViewFrame, views: Iterable[int], how: str) -> MultiViewF
 
 def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Issue]]:
     """Each pair of cameras with exchanged calibrations, as in `_changes`."""
-    names, frame = frame.cameras.names, limit_size(frame, PAIRS_PX)
+    names = frame.cameras.names
+    frame = limit_size(frame, PAIRS_PX)
     for first, second in itertools.combinations(range(len(names)), 2):
         order = list(range(len(names)))
         order[first], order[second] = second, first
@@ -224,7 +231,8 @@ def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float
 
 def _poses(cameras: Cameras) -> Iterator[tuple[str, Float[Tensor, "view 4 4"]]]:
     """What camera_from_world may have been confused with, and the corrected camera_from_world."""
-    stored, flip = cameras.camera_from_world, FLIP.to(cameras.K)
+    stored = cameras.camera_from_world
+    flip = FLIP.to(cameras.K)
     transposed = stored.clone()
     transposed[:, :3, :3] = stored[:, :3, :3].mT
     yield "R and t are camera-to-world", cameras.world_from_camera

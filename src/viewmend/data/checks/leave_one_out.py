@@ -16,50 +16,90 @@ from viewmend.geometry.line_of_sight import LinesOfSight, Rig
 from viewmend.geometry.proxy import reconstruct
 from viewmend.types import MultiViewFrame
 
-HULL, FINE_HULL = HullConfig(resolution=64), HullConfig(resolution=128)
-LONGEST_PX, FINE_PX = 256, 384
-"""Size of the images on which hulls are compared, first coarse, then fine: coarse hulls lose thin parts."""
+HULL = HullConfig(resolution=64)
+"""Hulls have this resolution in the first comparison."""
+FINE_HULL = HullConfig(resolution=128)
+"""Hulls have this resolution in the second comparison, because coarse hulls lose thin parts."""
+LONGEST_PX = 256
+"""Images of the first comparison have at most this many pixels along their longer side."""
+FINE_PX = 384
+"""Images of the second comparison have at most this many pixels along their longer side."""
 MIN_CAMERAS = 4
-"""With fewer cameras the faulty one cannot be determined."""
+"""The faulty camera can be determined in rigs of at least this many cameras."""
 MAX_PEERS = 10
-"""Number of other cameras in which the effect of a camera on the hull is measured."""
-MAX_REMOVED, LEAVE_OUT_REMOVED, LEAVE_OUT_OF_FEW = 0.004, 0.06, 0.2
-"""A camera is an outlier if it alone removes this share of the others' masks, beyond 1.5 times the mean. From the
-second share on, or the third in rigs of few cameras, it is left out: less costs less than a missing camera. The first
-share is of images of `FINE_PX` or more. It grows with the size of a pixel, up to twice: small ones lose thin parts."""
+"""The effect of a camera on the hull is measured in at most this many other cameras."""
 FEW_CAMERAS = 5
-MAX_OUTSIDE, LEAVE_OUT_OUTSIDE = 0.15, 0.3
-"""It is also one if this share of its mask is outside the others' hull, beyond 3 times the median."""
-
+"""Rigs of at most this many cameras can least do without one."""
 OUTLINE_LONGEST_PX = 384
-"""Size of the images whose outlines are compared."""
-OUTLINE_POINTS, MAX_OUTLINE_POINTS = 40, 400
-"""Maximum number of points per outline, and in total."""
+"""Outlines are compared in images of at most this many pixels along their longer side."""
+OUTLINE_POINTS = 40
+"""Each outline has at most this many points."""
+MAX_OUTLINE_POINTS = 400
+"""All outlines together have at most about this many points."""
 BOX_MARGIN = 1.5
-"""Growth of the search box over that of the hull, which a faulty camera reduces."""
+"""The search box is this many times as large as that of the hull, which a faulty camera makes too small."""
 MIN_OUTLINE_CAMERAS = 5
-"""With fewer, the outlines of the remaining cameras always agree too well."""
+"""Outlines are compared in rigs of at least this many cameras: the rest of smaller rigs always agrees too well."""
 WORST_POINTS = 0.01
-"""The largest part of the points that is not counted: single points miss thin parts, also in clean rigs."""
+"""This share of the points, the worst ones, is not counted: single points miss thin parts in clean rigs, too."""
 MIN_RESIDUAL_PX = 0.16
-"""Outlines with a smaller residual agree: in clean rigs of 8 to 20 cameras and up to 384 pixels it is below."""
+"""Outlines with a smaller residual, pixels, agree; clean rigs of 8 to 20 cameras stay below it."""
 RESOLUTION_PX = 0.01
-"""Smaller residuals are not distinguished."""
-SUSPECT_RATIO, MAX_SUSPECTS = 1.25, 3
-"""Cameras are suspects if the residual of their own outline is this many times the median; this many are tried."""
+"""Residuals below this many pixels are not distinguished."""
+SUSPECT_RATIO = 1.25
+"""A camera is a suspect if the residual of its own outline is more than this many times the median."""
+MAX_SUSPECTS = 3
+"""At most this many suspects are tried."""
 MAX_LEFT = 0.5
-"""A suspect is the outlier if at most this share of the residual is left without it."""
-MAX_LEFT_ROUGH, MIN_LEFT_OTHERS, ROUGH_PX = 0.67, 1.25, 0.4
-"""In rigs with at least the last residual: at most the first share, if leaving out any other suspect leaves the second
-number of times more."""
+"""A suspect is the outlier if at most this share of the residual remains without it."""
 AMBIGUOUS = 0.7
-"""The second suspect is named too if the ratio of the best residual to its own is higher."""
+"""The second suspect is named too if the ratio of the best residual to its own is higher than this."""
+
+
+@dataclass(frozen=True)
+class OutlierThresholds:
+    """Shares from which a camera that does not fit the hull of the others is an outlier, and is left out.
+
+    A smaller fault costs less than a missing camera, so the second share of each pair is higher.
+    """
+
+    removed: float = 0.004
+    """An outlier alone removes more than this share of the others' masks, beyond 1.5 times the mean.
+
+    The share is for images of `FINE_PX` or more. It doubles in small images, because those lose thin parts.
+    """
+    left_out_removed: float = 0.06
+    """An outlier that removes more than this share is left out."""
+    left_out_removed_of_few: float = 0.2
+    """The same share in rigs of at most `FEW_CAMERAS` cameras."""
+    outside: float = 0.15
+    """An outlier has more than this share of its mask outside the others' hull, beyond 3 times the median."""
+    left_out_outside: float = 0.3
+    """An outlier with more than this share of its mask outside is left out."""
+
+
+@dataclass(frozen=True)
+class RoughRigThresholds:
+    """The rule for rigs of rough calibration, in which a large residual remains without the outlier, too."""
+
+    min_residual_px: float = 0.4
+    """A rig is rough if its outlines have at least this residual, pixels."""
+    max_left: float = 0.67
+    """A suspect may be the outlier if at most this share of the residual remains without it."""
+    min_left_of_others: float = 1.25
+    """Leaving out any other suspect must leave at least this many times the residual that remains without it."""
+
+
+OUTLIER = OutlierThresholds()
+"""The shares that are used."""
+ROUGH_RIG = RoughRigThresholds()
+"""The rule that is used."""
 
 Silhouettes = Bool[Tensor, "view height width"]
 
 
 @dataclass(frozen=True)
-class LeaveOneOut:
+class OthersHulls:
     """Each camera compared with the hull of all others. That hull contains the subject, so it contains good masks."""
 
     silhouettes: Silhouettes
@@ -70,19 +110,23 @@ class LeaveOneOut:
     """The share of its own mask that lies outside the others' hull."""
 
 
-def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL) -> LeaveOneOut | None:
+def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL) -> OthersHulls | None:
     """Compute a small hull without each camera in turn; None if too few cameras have any foreground."""
-    names, mask = frame.cameras.names, frame.mask
+    names = frame.cameras.names
+    mask = frame.mask
     if mask is None or len(names) < MIN_CAMERAS:
         return None
-    inside, step = mask > FOREGROUND, max(1, -(-len(names) // MAX_PEERS))
+    inside = mask > FOREGROUND
+    step = max(1, -(-len(names) // MAX_PEERS))
     if int(inside.flatten(1).any(1).sum()) < 2:
         return None
     try:
         missed = missed_share(inside, reconstruct(mask, frame.cameras, bounds, hull).depth(frame.cameras) > 0)
-        silhouettes, removed = [], []
+        silhouettes = []
+        removed = []
         for view, name in enumerate(names):
-            others, peers = frame.without([name]), [v for v in range(0, len(names), step) if v != view]
+            others = frame.without([name])
+            peers = [v for v in range(0, len(names), step) if v != view]
             assert others.mask is not None
             proxy = reconstruct(others.mask, others.cameras, bounds, hull)
             covered = pad_like(proxy.depth(frame.cameras[[view, *peers]]) > 0, mask)
@@ -91,7 +135,7 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig
     except ValueError:  # without this camera, nothing is in front of all others
         return None
     covered = torch.stack(silhouettes)
-    return LeaveOneOut(covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0))
+    return OthersHulls(covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0))
 
 
 def missed_share(inside: Silhouettes, covered: Silhouettes) -> Float[Tensor, "view"]:
@@ -117,21 +161,23 @@ def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull
     found = leave_one_out(small, bounds, hull)
     if found is None:
         return ()
-    names, few = small.cameras.names, len(small.cameras) <= FEW_CAMERAS
+    names = small.cameras.names
+    few = len(small.cameras) <= FEW_CAMERAS
     view = int(found.outside.argmax())
     share = float(found.outside[view])
-    if share > MAX_OUTSIDE + 3 * float(found.outside.median()):
+    if share > OUTLIER.outside + 3 * float(found.outside.median()):
         if _is_explained_by_borders(small, bounds, view):
             return (Issue(_cut_off_text(small)),)
         text = f"camera '{names[view]}': {100 * share:.0f} % of its mask is outside the hull of all others"
-        return (_outlier(text, names[view], share > LEAVE_OUT_OUTSIDE),)
+        return (_outlier(text, names[view], share > OUTLIER.left_out_outside),)
     view = int(found.removed.argmax())
     share = float(found.removed[view])
     typical = max(0.0, float((found.removed.sum() - found.removed[view]) / (len(names) - 1)))
     coarser = min(2.0, FINE_PX / min(FINE_PX, int(frame.cameras.size_px.amax())))
-    if share > MAX_REMOVED * coarser + 1.5 * typical:
+    if share > OUTLIER.removed * coarser + 1.5 * typical:
         text = f"camera '{names[view]}' alone removes {100 * share:.1f} % of the subject that the others see"
-        return (_outlier(text, names[view], share > (LEAVE_OUT_OF_FEW if few else LEAVE_OUT_REMOVED)),)
+        bound = OUTLIER.left_out_removed_of_few if few else OUTLIER.left_out_removed
+        return (_outlier(text, names[view], share > bound),)
     return ()
 
 
@@ -149,7 +195,7 @@ def _is_explained_by_borders(frame: MultiViewFrame, bounds: Bounds | None, view:
     except ValueError:
         return False
     covered = pad_like(proxy.depth(own.cameras) > 0, own.mask)
-    return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= MAX_OUTSIDE
+    return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= OUTLIER.outside
 
 
 def _cut_off_text(frame: MultiViewFrame) -> str:
@@ -196,7 +242,11 @@ def find_outlier_by_outlines(frame: MultiViewFrame, bounds: Bounds | None) -> tu
     order = np.argsort(left)
     best = left[order[0]]
     second = left[order[1]] if len(order) > 1 else residual
-    rough = residual >= ROUGH_PX and best <= MAX_LEFT_ROUGH * residual and second >= MIN_LEFT_OTHERS * best
+    rough = (
+        residual >= ROUGH_RIG.min_residual_px
+        and best <= ROUGH_RIG.max_left * residual
+        and second >= ROUGH_RIG.min_left_of_others * best
+    )
     if best > MAX_LEFT * residual and not rough:
         return None
     named = [index for index in order[:2] if best > AMBIGUOUS * left[index] or index == order[0]]

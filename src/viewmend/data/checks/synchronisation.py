@@ -22,9 +22,11 @@ MIN_DELAY_GAIN = 0.008
 """A camera may be delayed if the share of its mask outside the others' hull is this much lower in another frame."""
 MAX_DELAY_CANDIDATES = 3
 """The camera opposite a delayed one looks delayed too, so several are tried."""
-MIN_EXPLAINED, MIN_EXPLAINED_SHARE = 0.002, 0.3
-"""A camera is delayed if its mask of another frame lets the hull explain this much more of all masks, and this share of
-what it did not explain: in a rig whose calibration is off, other frames fit a little better by chance."""
+MIN_EXPLAINED = 0.002
+"""A camera is delayed if its mask of another frame lets the hull explain more of all masks, by this share of them."""
+MIN_EXPLAINED_SHARE = 0.3
+"""It must also explain this share of what the hull left unexplained: with a calibration that is off, other frames fit
+a little better by chance."""
 SHARPER = 1.015
 """Images are delayed if those of another frame have this much stronger edges along the outlines of the masks."""
 MIN_OUTLINE_FRAMES = 3
@@ -45,7 +47,8 @@ def find_desynchronised_cameras(
         return issues
     later = find_desynchronised_camera(*_frames_around(source, frame, last), source.bounds, source.fps)
     text = "{} (at frame '{}', but not at frame '{}': frames were lost or repeated in between)"
-    first_id, last_id = source.frame_ids[frame.time], source.frame_ids[last]
+    first_id = source.frame_ids[frame.time]
+    last_id = source.frame_ids[last]
     return tuple(replace(issue, text=text.format(issue.text, last_id, first_id)) for issue in later)
 
 
@@ -59,7 +62,8 @@ def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> t
     times = list(range(max(0, time - MAX_DELAY), min(count, time + MAX_DELAY + 1)))
     frames = [frame if other == frame.time else source.read(other) for other in times]
     seen = [at for at, other in enumerate(frames) if other.has_subject]
-    wanted, middle = set(frame.cameras.names), min(seen or [0], key=lambda at: abs(times[at] - time))
+    wanted = set(frame.cameras.names)
+    middle = min(seen or [0], key=lambda at: abs(times[at] - time))
     while middle < len(frames) - 2 and not wanted <= set(frames[-1].cameras.names):  # where some cameras have ended
         frames.pop()
     while middle > 1 and not wanted <= set(frames[0].cameras.names):  # or have not begun
@@ -86,7 +90,8 @@ def find_desynchronised_camera(
         return ()
     shares = [missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
     outside = torch.stack(shares).nan_to_num(1.0)
-    gain, best = outside[middle] - outside.amin(0), outside.argmin(0).tolist()
+    gain = outside[middle] - outside.amin(0)
+    best = outside.argmin(0).tolist()
     views = gain.argsort(descending=True)[:MAX_DELAY_CANDIDATES].tolist()
     tried = [view for view in views if float(gain[view]) > MIN_DELAY_GAIN]
     unexplained = {view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds) for view in tried}
@@ -97,7 +102,8 @@ def find_desynchronised_camera(
             frames_late = best[view] - middle
             shift = "shift its files in time"
             if fps is not None:
-                change, by_ms = "raise" if frames_late > 0 else "lower", abs(1000 * frames_late / fps)
+                change = "raise" if frames_late > 0 else "lower"
+                by_ms = abs(1000 * frames_late / fps)
                 shift += f", or {change} its offset_ms in cameras.json by {by_ms:.0f}"
             delay = describe_delay(frames_late)
             return (Issue(f"camera '{names[view]}': {delay}, compared with the others' masks; {shift}"),)
@@ -106,7 +112,8 @@ def find_desynchronised_camera(
 
 def _with_mask_of(frames: Sequence[MultiViewFrame], middle: int, view: int, time: int) -> MultiViewFrame:
     """The frame in the middle, with one camera's mask from another frame."""
-    own, other = frames[middle].mask, frames[time].mask
+    own = frames[middle].mask
+    other = frames[time].mask
     assert own is not None and other is not None
     return replace(frames[middle], mask=torch.cat([own[:view], other[view, None], own[view + 1 :]]))
 
@@ -150,7 +157,8 @@ def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]
 def _gradient(image: Float[Tensor, "view channel height width"]) -> Float[Tensor, "view channel 2 height width"]:
     """Central differences in x and y."""
     padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
-    x, y = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    x = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
+    y = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     return torch.stack([x, y], 2)
 
 
@@ -160,7 +168,8 @@ def _edge_ratio(
     delay: int,
 ) -> Float[Tensor, "view"]:
     """Strength of the edges across an outline in the image `delay` frames later, relative to its own; the median."""
-    first, count = max(0, -delay), len(edges) - abs(delay)
+    first = max(0, -delay)
+    count = len(edges) - abs(delay)
     own, shifted = (edges[start : start + count] for start in (first, first + delay))
     normals = outlines[first : first + count]
     later, now = ((image * normals).sum(3).abs().sum((2, 3, 4)) for image in (shifted, own))

@@ -82,7 +82,8 @@ def _is_capture(folder: Path, names: Iterable[str], native: bool) -> bool:
 
 def _as_stored(calibration: NativeCalibration) -> NativeCalibration:
     """The calibration with the paths of its files as they are on disk."""
-    folder, frames = calibration.folder, calibration.frames
+    folder = calibration.folder
+    frames = calibration.frames
     cameras = []
     for camera in calibration.cameras:
         files: Any = {kind: stored_path(folder, getattr(camera, kind), frames) for kind in camera.file_kinds}
@@ -98,7 +99,8 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
     """
     if format not in (None, *FORMAT_NAMES):
         raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
-    native, names = format in (None, "plain"), [name for name in FORMATS if format in (None, name)]
+    native = format in (None, "plain")
+    names = [name for name in FORMATS if format in (None, name)]
     if native and (path / CALIBRATION).is_file():
         return _as_stored(read_calibration(path))
     name, file = _find(path, names)

@@ -60,10 +60,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     for camera, image in zip(used, images, strict=True):
         label = camera.get("label", "")
         R, center = _pose(label, camera, chunk)
-        mask, lens = (
-            find_mask(folder, image.removeprefix("images/")),
-            _lens(label, sensors.get(camera.get("sensor_id"))),
-        )
+        mask = find_mask(folder, image.removeprefix("images/"))
+        lens = _lens(label, sensors.get(camera.get("sensor_id")))
         posed.append(PosedImage(image, mask, lens, R, center))
     if (rig := fixed_cameras(posed)) is not None:
         cameras, frames = rig
@@ -133,7 +131,10 @@ def _lens(name: str, sensor: Element | None) -> dict[str, Any]:
     cx, cy, k1, k2, k3, p1, p2 = (_value(name, lens, key) for key in ("cx", "cy", "k1", "k2", "k3", "p1", "p2"))
     if lens.find("f") is not None:
         f, b1, skew = (_value(name, lens, key) for key in ("f", "b1", "b2"))
-        fx, fy, cx, cy = f + b1, f, cx + width / 2, cy + height / 2
+        fx = f + b1
+        fy = f
+        cx = cx + width / 2
+        cy = cy + height / 2
     else:  # before version 1.2
         fx, fy, skew = (_value(name, lens, key) for key in ("fx", "fy", "skew"))
     K = [[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
@@ -151,7 +152,9 @@ def _pose(name: str, camera: Element, chunk: Element) -> tuple[Float64[np.ndarra
     number = camera.get("component_id", "")
     component = chunk.find(f"./components/component[@id='{number if number.isdecimal() else ''}']/transform")
     transform = chunk.find("transform") if component is None else component
-    turn, shift, scale = np.eye(3), np.zeros(3), 1.0
+    turn = np.eye(3)
+    shift = np.zeros(3)
+    scale = 1.0
     if transform is not None and transform.find("rotation") is not None:
         turn = _numbers(name, transform.find("rotation"), 9).reshape(3, 3)
         shift = _numbers(name, transform.find("translation"), 3)

@@ -69,9 +69,11 @@ def _read(file: Path) -> tuple[dict[int, dict[str, Any]], list[ColmapImage]]:
     cameras, images = (bounded_bytes(path, MAX_BYTES) for path in (file, file.with_name(f"images{file.suffix}")))
     try:
         if file.suffix == ".bin":
-            lenses, views = _binary_lenses(cameras), _binary_images(images)
+            lenses = _binary_lenses(cameras)
+            views = _binary_images(images)
         else:
-            lenses, views = _text_lenses(decode_text(cameras, "cameras.txt")), _text_images(decode_text(images, IMAGES))
+            lenses = _text_lenses(decode_text(cameras, "cameras.txt"))
+            views = _text_images(decode_text(images, IMAGES))
     except (struct.error, IndexError):
         raise ValueError("expected complete files of cameras and images, got less; export the model again") from None
     return lenses, sorted((view._replace(name=view.name.replace("\\", "/")) for view in views), key=lambda v: v.name)
@@ -98,7 +100,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         if view.camera not in lenses:
             expected = f"a camera with the id {view.camera} of image '{view.name[:40]}'"
             raise ValueError(f"expected {expected}, got none; export the model again")
-        R, t = _rotation(view), np.array(view.t)
+        R = _rotation(view)
+        t = np.array(view.t)
         images.append(PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t))
     if (rig := fixed_cameras(images)) is not None:
         cameras, frames = rig
@@ -128,7 +131,9 @@ def _count_moments(file: Path) -> int:
 
 def _binary_frame_sizes(data: bytes) -> list[int]:
     """The number of images of each frame: after an id, the rig's id and a pose, then 16 bytes for each image."""
-    (count,), at, sizes = struct.unpack_from("<Q", data), 8, []
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    sizes = []
     for _ in range(count):
         (size,) = struct.unpack_from("<I", data, at + 64)
         at += 68 + 16 * size
@@ -144,7 +149,9 @@ def _text_frame_sizes(data: bytes) -> list[int]:
 
 def _binary_lenses(data: bytes) -> dict[int, dict[str, Any]]:
     by_number = {number: model for model, (number, _) in MODELS.items()}
-    (count,), at, lenses = struct.unpack_from("<Q", data), 8, {}
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    lenses = {}
     for _ in range(count):
         camera, number, width, height = struct.unpack_from("<iiQQ", data, at)
         model = by_number.get(number, f"number {number}")
@@ -155,7 +162,9 @@ def _binary_lenses(data: bytes) -> dict[int, dict[str, Any]]:
 
 
 def _binary_images(data: bytes) -> list[ColmapImage]:
-    (count,), at, images = struct.unpack_from("<Q", data), 8, []
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
+    images = []
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
@@ -173,7 +182,9 @@ def _text_lenses(text: str) -> dict[int, dict[str, Any]]:
         words = line.split()
         if words and not words[0].startswith("#"):
             try:
-                camera, width, height = int(words[0]), int(words[2]), int(words[3])
+                camera = int(words[0])
+                width = int(words[2])
+                height = int(words[3])
                 values = [float(word) for word in words[4:]]
             except (ValueError, IndexError):
                 raise _bad_line("cameras.txt", number, "an id, a model, a size and its parameters", line) from None
@@ -183,7 +194,8 @@ def _text_lenses(text: str) -> dict[int, dict[str, Any]]:
 
 def _text_images(text: str) -> list[ColmapImage]:
     """The images: lines of a pose and a name, each followed by a line of points, which may be empty."""
-    images, follows = [], False
+    images = []
+    follows = False
     for number, line in enumerate(text.split("\n"), 1):
         words = line.split(maxsplit=9)
         if words and words[0].startswith("#"):
@@ -231,7 +243,8 @@ def _lens(model: str, width: int, height: int, values: list[float]) -> dict[str,
     lens = dict(zip(names, values, strict=True))
     if lens.get("k4") or lens.get("k5") or lens.get("k6"):
         raise ValueError(f"expected {model} with k4, k5 and k6 of 0, got others; undistort the images in COLMAP first")
-    fx, fy = lens.get("fx", lens.get("f")), lens.get("fy", lens.get("f"))
+    fx = lens.get("fx", lens.get("f"))
+    fy = lens.get("fy", lens.get("f"))
     K = [[fx, 0.0, lens["cx"]], [0.0, fy, lens["cy"]], [0.0, 0.0, 1.0]]
     dist = [lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     return {"width": width, "height": height, "K": K, "dist": dist}

@@ -9,7 +9,10 @@ import numpy as np
 from viewmend.data.containers import member, names_in, open_container
 from viewmend.data.formats.files import files_like, folders_containing, image_size_px, invert_pose, to_distortion
 
-SUFFIX, ANNOTATIONS = ".smc", "_annots.smc"
+SUFFIX = ".smc"
+"""Files of the data set have this suffix."""
+ANNOTATIONS = "_annots.smc"
+"""Names of files with calibration and masks end with this."""
 GROUPS = ("Camera_5mp", "Camera_12mp")
 """The two camera models; their cameras are numbered consecutively."""
 FPS = 15.0
@@ -41,7 +44,8 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     main, masks = (os.path.relpath(one.absolute(), folder) for one in (file, annotations))
     parameters = _parameters(annotations)
     masked = _camera_numbers(annotations, "Mask")
-    entries, frames = [], set()
+    entries = []
+    frames = set()
     for group in GROUPS:
         for camera in sorted(_camera_numbers(file, group) & parameters.keys(), key=int):
             own = {frame for frame in names_in(file / group / camera / "color") if frame.isdecimal()}

@@ -26,7 +26,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     """All cameras of the files; they may not move."""
     if file.parent != folder:
         raise ValueError("expected static cameras, got poses per frame; write intri.yml for the whole rig")
-    intrinsics, extrinsics = read_storage(file), read_storage(file.with_name("extri.yml"))
+    intrinsics = read_storage(file)
+    extrinsics = read_storage(file.with_name("extri.yml"))
     names = [name for name in intrinsics.get("names", ()) if stays_inside(name)]
     if not any(f"K_{name}" in intrinsics for name in names):  # YAML reads 00 without quotes as the number 0
         names = sorted(key[2:] for key in intrinsics if key.startswith("K_") and stays_inside(key[2:]))
@@ -36,7 +37,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     entries = []
     for name in (name for name in names if name in footage):
         K = _matrix(intrinsics, f"K_{name}", 9).reshape(3, 3)
-        W, H = intrinsics.get(f"W_{name}"), intrinsics.get(f"H_{name}")
+        W = intrinsics.get(f"W_{name}")
+        H = intrinsics.get(f"H_{name}")
         size = (W, H) if isinstance(W, float) and isinstance(H, float) and W and H else None
         dist = next((intrinsics[key] for key in (f"dist_{name}", f"D_{name}") if key in intrinsics), np.zeros(5))
         rotation = extrinsics.get(f"Rot_{name}", extrinsics.get(f"R_{name}"))

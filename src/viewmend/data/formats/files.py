@@ -123,7 +123,8 @@ def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     if len(set(paths)) == 1:
         return paths[0], ("0",) * len(paths)
     same = [takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False)) for step in (1, -1)]
-    before, after = paths[0][: len(list(same[0]))].rstrip("0123456789"), len(list(same[1]))
+    before = paths[0][: len(list(same[0]))].rstrip("0123456789")
+    after = len(list(same[1]))
     after = paths[0][len(paths[0]) - min(after, min(map(len, paths)) - len(before)) :].lstrip("0123456789")
     ids = tuple(path[len(before) : len(path) - len(after)] for path in paths)
     if not all(ids) or any("/" in name for name in ids):
@@ -287,7 +288,9 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
-    entries, ids, ignored = {}, {}, []
+    entries = {}
+    ids = {}
+    ignored = []
     shown = {name: _videos_of_subject(folder, path) for name, path in paths.items()}
     several = {name: found for name, found in shown.items() if len(found) > 1 and not list_images(folder, paths[name])}
     if several:
@@ -341,9 +344,11 @@ def list_images(folder: Path, place: str) -> ImageList | None:
         pattern, frames = frame_pattern(alike)
     elif numbered:
         before, number, after = re.findall(r"(.*?)(\d+)(\D*\.\w+)", alike[0])[0]
-        pattern, frames = f"{before}{{frame}}{after}", (number,)
+        pattern = f"{before}{{frame}}{after}"
+        frames = (number,)
     else:
-        pattern, frames = f"{{frame}}{Path(alike[0]).suffix}", tuple(Path(name).stem for name in alike)
+        pattern = f"{{frame}}{Path(alike[0]).suffix}"
+        frames = tuple(Path(name).stem for name in alike)
     others = [name for name in names if name not in set(alike)]
     ignored = f"{len(others)} of {len(names)}, such as {others[0]}" if others else ""
     return ImageList(f"{place}/{pattern}".removeprefix("/"), frozenset(frames), ignored)

@@ -51,7 +51,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     footage = collect_footage(folder, {name: f"{place}/{name}" for name in used})
     entries = []
     for name, value in used.items():
-        entry, pose = footage.entry(name), _pose(name, value)
+        entry = footage.entry(name)
+        pose = _pose(name, value)
         K = _resize(lens.intrinsics, full, (entry["width"], entry["height"]))
         dist = to_distortion(name, lens.dist)
         entries.append(entry | {"K": K, "dist": dist, "R": pose.rotation, "t": pose.translation})
@@ -68,7 +69,8 @@ def _pose(name: str, value: Any) -> Pose:
 
 def _resize(K: tuple[Triple, ...], full: tuple[int, int], size: tuple[int, int]) -> list[list[float]]:
     """K of the smaller image, with the first pixel centre at 0.5, the convention in which K scales with the size."""
-    sx, sy = size[0] / full[0], size[1] / full[1]
+    sx = size[0] / full[0]
+    sy = size[1] / full[1]
     if abs(sx - sy) > 1 / min(full):
         got = f"{size[0]} x {size[1]}"
         raise ValueError(f"expected images of the shape of {full[0]} x {full[1]}, got {got}; do not crop them")

@@ -53,7 +53,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     entries = []
     for name, path in ((name, path) for name, path in cameras if name in footage):
         values = _values(read_storage(path))
-        W, H = values.get("width"), values.get("height")
+        W = values.get("width")
+        H = values.get("height")
         size = (float(W), float(H)) if isinstance(W, int | float) and isinstance(H, int | float) else None
         entries.append(footage.entry(name, size) | _calibration(name, values))
     return {"frames": footage.frames, "fps": footage.fps, "cameras": entries}
@@ -75,7 +76,8 @@ def _cameras(folder: Path) -> list[tuple[str, Path]]:
 def _complete_files(place: Path) -> list[Path]:
     """The files in a folder that have intrinsics and a pose; if there are none, those that are invalid."""
     files = [path for path in files_like(place, "*.*") if path.suffix.lower() in SUFFIXES]
-    complete, invalid = [], []
+    complete = []
+    invalid = []
     for path in (path for path in files if b"opencv" in bounded_bytes(path, MAX_BYTES)):
         try:
             if {"K", "R", "t"} <= _values(read_storage(path)).keys():
@@ -93,7 +95,8 @@ def _values(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def _calibration(name: str, values: dict[str, Any]) -> dict[str, Any]:
-    K, t = np.asarray(values.get("K", [])), np.asarray(values.get("t", []))
+    K = np.asarray(values.get("K", []))
+    t = np.asarray(values.get("t", []))
     if K.size != 9 or t.size != 3:
         got = f"{K.size} and {t.size}"
         raise ValueError(f"camera '{name}': expected a matrix of 9 numbers and a translation of 3, got {got}; add them")
@@ -147,7 +150,8 @@ def _xml_value(element: Element) -> Any:
 
 def _matrix(key: str, stored: dict[str, Any]) -> np.ndarray:
     """The numbers of a stored matrix in row-major order, `(rows * cols * channels,)`."""
-    data, dt = stored["data"], stored.get("dt", "d")
+    data = stored["data"]
+    dt = stored.get("dt", "d")
     numbers = [_number(value) for value in data] if isinstance(data, list) else []
     sides = [_number(stored.get("rows")), _number(stored.get("cols"))]
     channels = _number(dt.strip('"')[:-1] or "1") if isinstance(dt, str) else None

@@ -36,7 +36,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
 
 
 def _calibration(name: str, camera: Element) -> dict[str, Any]:
-    intrinsic, transform = camera.find("intrinsic"), camera.find("transform")
+    intrinsic = camera.find("intrinsic")
+    transform = camera.find("transform")
     fx, fy, cx, cy, skew = xml_attributes(name, intrinsic, "focalLengthU focalLengthV centerPointU centerPointV skew")
     k1, k2, k3 = xml_attributes(name, intrinsic, "radialDistortion1 radialDistortion2 radialDistortion3")
     p1, p2 = xml_attributes(name, intrinsic, "tangentalDistortion1 tangentalDistortion2")

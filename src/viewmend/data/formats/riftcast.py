@@ -113,8 +113,10 @@ def _frames(folder: Path, meta: MetaFile | None) -> list[str]:
 
 
 def _camera(folder: Path, camera: _Camera, frames: list[str]) -> dict[str, Any]:
-    name, view = str(camera.camera_id), np.array(camera.extrinsics.view_matrix).reshape(4, 4)
-    K, size = np.array(camera.intrinsics.camera_matrix).reshape(3, 3), camera.intrinsics.resolution
+    name = str(camera.camera_id)
+    view = np.array(camera.extrinsics.view_matrix).reshape(4, 4)
+    K = np.array(camera.intrinsics.camera_matrix).reshape(3, 3)
+    size = camera.intrinsics.resolution
     entry = {"name": name, "width": size[0], "height": size[1], "K": K.tolist()}
     entry |= {"R": view[:3, :3].tolist(), "t": view[:3, 3].tolist()}
     entry["dist"] = to_distortion(name, camera.intrinsics.distortion_coefficients)

@@ -177,7 +177,8 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
                 f"expected a 'time' in each frame, and each camera's pose at two or more times, got {got}; add them, "
                 "or write one file for each time (a single moving camera cannot be used)"
             )
-        entries, patterns = list(at_pose.values()), {}
+        entries = list(at_pose.values())
+        patterns = {}
         for key in ("file_path", "mask_path", "depth_file_path"):
             paths = [path for entry in entries if (path := getattr(entry, key))]
             pattern, found = frame_pattern(paths) if len(paths) == len(entries) else (None, ())
@@ -199,7 +200,8 @@ def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str
         raise ValueError(f"expected a camera_model among {', '.join(MODELS)}, got {got}; undistort the images first")
     if any(lens["rolling_shutter"] or ()):
         raise ValueError("expected images of one moment, got rolling_shutter; correct the images and set it to zeros")
-    width, height = lens["w"], lens["h"]
+    width = lens["w"]
+    height = lens["h"]
     if width is None or height is None:
         width, height = image_size_px(folder, path)
     fx = lens["fl_x"]
@@ -210,7 +212,8 @@ def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str
     fy = lens["fl_y"]
     if fy is None:
         fy = height / (2 * math.tan(lens["camera_angle_y"] / 2)) if lens["camera_angle_y"] else fx
-    cx, cy = _first(lens["cx"], width / 2), _first(lens["cy"], height / 2)
+    cx = _first(lens["cx"], width / 2)
+    cy = _first(lens["cy"], height / 2)
     K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     dist = [lens[key] or 0.0 for key in ("k1", "k2", "p1", "p2", "k3")]
     return {"width": width, "height": height, "K": K, "dist": dist}

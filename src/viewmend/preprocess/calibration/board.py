@@ -11,22 +11,31 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
+from viewmend.data.camera_reader import CameraReader
+from viewmend.data.capture_folder import read_clock
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats.files import collect_footage, list_images
-from viewmend.data.native_capture import CameraReader, read_clock
 from viewmend.data.native_format import FILE_KINDS, NativeCalibration, NativeCamera
 from viewmend.data.videos import is_video
 
 ALONG = 0.42
 """Part of each edge that is used, as a share of a square's side."""
-CLEAR_PX, LEAST_CLEAR = 0.8, 0.35
-"""Distance kept from the markers, and the least share of the gap that is used."""
-BLUR_PX, BLURS_PX = 0.5, (0.3, 2.0)
-"""How soft edges are at first, and may be: the hyperbolic tangent's scale."""
+CLEAR_PX = 0.8
+"""Pixels closer to a marker than this, pixels, are not used."""
+LEAST_CLEAR = 0.35
+"""At least this share of the gap between corner and marker is used."""
+BLUR_PX = 0.5
+"""The search begins with edges this soft: the scale of the hyperbolic tangent, pixels."""
+BLURS_PX = (0.3, 2.0)
+"""Edges are at least and at most this soft, pixels."""
 STEPS = 6
+"""A corner is refined in at most this many steps."""
 LEAST_PIXELS = 12
-MOST_STEP_PX, MOST_MOVE_PX = 0.5, 2.5
-"""A step is cut to the first; a corner that would end farther from where it was found stays there."""
+"""A corner is refined if at least this many pixels show its edges."""
+MOST_STEP_PX = 0.5
+"""A step moves a corner by at most this many pixels."""
+MOST_MOVE_PX = 2.5
+"""A corner that would end more than this many pixels from where it was found stays there."""
 OUTLIER_PX = 1.5
 """Corners farther from the plane of the others are ignored."""
 
@@ -87,11 +96,14 @@ def _fitted(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndar
 
     The picture is a + b tanh((x - x0) / s) tanh((y - y0) / s), with all lengths in pixels.
     """
-    cross, blur = np.zeros(2), BLUR_PX
+    cross = np.zeros(2)
+    blur = BLUR_PX
     for _ in range(STEPS):
         x, y = ((at - cross) / blur).T
-        fx, fy = np.tanh(x), np.tanh(y)
-        dx, dy = (1 - fx**2) * fy / blur, (1 - fy**2) * fx / blur
+        fx = np.tanh(x)
+        fy = np.tanh(y)
+        dx = (1 - fx**2) * fy / blur
+        dy = (1 - fy**2) * fx / blur
         level = np.stack([np.ones_like(x), fx * fy], 1)
         a, b = np.linalg.lstsq(level, values, rcond=None)[0]
         columns = [*level.T, -b * dx, -b * dy, -b * (dx * x + dy * y)]
@@ -175,7 +187,10 @@ def parse_board(text: str, dictionary: str) -> Board:
     if parts is None:
         example = "8x6:0.06:0.045 for 8 x 6 squares of 6 cm with markers of 4.5 cm"
         raise ValueError(f"expected --board COLUMNSxROWS:SQUARE_M:MARKER_M, got '{text}'; write {example}")
-    columns, rows, square_m, marker_m = int(parts[1]), int(parts[2]), float(parts[3]), float(parts[4])
+    columns = int(parts[1])
+    rows = int(parts[2])
+    square_m = float(parts[3])
+    marker_m = float(parts[4])
     if not (min(columns, rows) >= 4 and 0 < marker_m < square_m):
         expected = "at least 4 x 4 squares, and markers smaller than squares"
         raise ValueError(f"expected {expected}, got '{text}'; measure again")
@@ -192,7 +207,8 @@ def open_footage(folder: Path) -> NativeCalibration:
         entry.name: entry.name for entry in entries if entry.is_dir() and list_images(folder, entry.name)
     }
     if len(chosen) < 2:
-        expected, got = "two or more videos, or folders of images", len(chosen)
+        expected = "two or more videos, or folders of images"
+        got = len(chosen)
         raise CaptureError(f"{folder}: expected {expected}, got {got}; put one for each camera there, named after it")
     try:
         footage = collect_footage(folder, chosen)
@@ -215,7 +231,8 @@ def look_for(
     `track` wraps the cameras that are iterated over, as a progress bar. CaptureError if an image cannot be read, or has
     another size than the camera's first.
     """
-    seen, clock = {}, read_clock(footage)
+    seen = {}
+    clock = read_clock(footage)
     for view, camera in enumerate(track(footage.cameras)):
         reader = CameraReader(footage.folder, camera, footage.frames, clock)
         for time in times:

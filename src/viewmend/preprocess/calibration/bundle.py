@@ -24,8 +24,10 @@ LEAST_VIEWS = 5
 """Images of the board that a camera needs."""
 MOST_VIEWS = 40
 """Images used for the first calibration of a camera; the adjustment uses all."""
-CAMERA, POSE = 12, 6
-"""Parameters of a camera: fx fy cx cy k1 k2, rotation, translation; and of the board at one time."""
+CAMERA = 12
+"""A camera has this many parameters: fx, fy, cx, cy, k1, k2, rotation and translation."""
+POSE = 6
+"""The board's pose at one time has this many parameters: rotation and translation."""
 OUTLIER_PX = 0.3
 """Residuals above this count less: corners of boards that are seen aslant are found less well."""
 CENTRE_PX = 0.05
@@ -144,7 +146,9 @@ class _Rows:
 
     def __init__(self, seen: Seen, board: Board, sizes: Sequence[Size], times: Sequence[int]):
         keys = sorted(seen)
-        self.views, self.times, self.size = len(sizes), len(times), np.array(sizes, float)
+        self.views = len(sizes)
+        self.times = len(times)
+        self.size = np.array(sizes, float)
         self.pixels = np.concatenate([seen[key].pixels for key in keys])
         self.points = np.concatenate([board.corners_m[seen[key].ids] for key in keys])
         counts = [len(seen[key].ids) for key in keys]
@@ -182,11 +186,13 @@ class _Rows:
 
     def cameras(self, x: Float64[np.ndarray, "parameter"]) -> list[CalibratedCamera]:
         """The cameras that the parameters mean."""
-        off, camera = self.residuals(x)[: self.pixels.size].reshape(-1, 2), self._split(x)[0]
+        off = self.residuals(x)[: self.pixels.size].reshape(-1, 2)
+        camera = self._split(x)[0]
         found = []
         for view, (fx, fy, cx, cy, k1, k2) in enumerate(camera[:, :6]):
             own = self.view == view
-            K, dist = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, 0, 0, 0])
+            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+            dist = np.array([k1, k2, 0, 0, 0])
             found.append(CalibratedCamera(K, dist, _matrix(camera[view, 6:]), self.pixels[own], off[own]))
         return found
 

@@ -46,7 +46,8 @@ def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "po
 
 def _similarity(source: Places, target: Places) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
     """R, t and s for which s R x + t is nearest to the targets."""
-    a, b = source - source.mean(0), target - target.mean(0)
+    a = source - source.mean(0)
+    b = target - target.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
     R = (u * sign) @ vt
@@ -61,11 +62,16 @@ CAMERA = 7
 HOLDS = (1e-3, 0.1)
 """Strength of the prior on the present cameras, since outlines do not determine everything. The second value is for few
 frames and hard masks; held-out cameras decide which is better."""
-SEARCHES, STEPS, ENOUGH = 6, 6, 0.02
-"""Number of searches, and most steps between them; fewer if a search gains less than
-this share of what is missed."""
-DAMPING, MOST_DAMPING = 1e-3, 1e4
-"""Levenberg and Marquardt's, at the start, and where no smaller step would help."""
+SEARCHES = 6
+"""The best places on the lines of sight are searched at most this many times."""
+STEPS = 6
+"""The cameras move in at most this many steps between two searches."""
+ENOUGH = 0.02
+"""The steps end when one reduces the residual by less than this share."""
+DAMPING = 1e-3
+"""The damping of Levenberg and Marquardt begins with this value."""
+MOST_DAMPING = 1e4
+"""The steps end when the damping of Levenberg and Marquardt exceeds this value."""
 
 Moves = Float64[np.ndarray, "view parameter"]
 Depths = list[Float64[np.ndarray, "_point"]]
@@ -121,7 +127,8 @@ class _Problem:
     """Residuals of the outlines of some frames as functions of camera motion."""
 
     def __init__(self, sights: Sequence[LinesOfSight], start: Rig, hold: float):
-        self.sights, self.start = sights, start
+        self.sights = sights
+        self.start = start
         middle = np.mean([sight.middle for sight in sights], 0)
         far_m = np.linalg.norm(start.R @ middle + start.t, axis=1)
         m_per_px = far_m / start.K[:, 0, 0]
@@ -143,7 +150,8 @@ class _Problem:
 
     def solved(self, x: Moves, depths: Depths) -> Moves:
         """The moves at which least is missed, of places near the given ones (Levenberg and Marquardt)."""
-        cost, damping = self.cost(x, depths), DAMPING
+        cost = self.cost(x, depths)
+        damping = DAMPING
         for _ in range(STEPS):
             H, g = self.normal_equations(x, depths)
             while damping < MOST_DAMPING:
@@ -154,7 +162,11 @@ class _Problem:
                 damping *= 10
             else:
                 break
-            gain, x, depths, cost, damping = 1 - new / cost, moved, tried, new, damping / 10
+            gain = 1 - new / cost
+            x = moved
+            depths = tried
+            cost = new
+            damping = damping / 10
             if gain < ENOUGH:
                 break
         return x
@@ -185,7 +197,8 @@ class _Problem:
     def normal_equations(self, x: Moves, depths: Depths) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"]]:
         """Gauss and Newton's, without the places' own depths, which follow."""
         rig = self.rig(x)
-        H, g = self.hold * np.eye(x.size), self.hold * x.ravel()
+        H = self.hold * np.eye(x.size)
+        g = self.hold * x.ravel()
         for sight, depth in zip(self.sights, depths, strict=True):
             J, r = self._rows(sight, rig, depth)
             rows = J.reshape(-1, x.size)
@@ -198,13 +211,16 @@ class _Problem:
     ) -> tuple[Float64[np.ndarray, "point view view parameter"], Float64[np.ndarray, "point view"]]:
         """What each place is outside of each mask, weighted, and how the cameras change it where its depth follows."""
         seen = sight.sample(rig, depth[:, None])
-        place, outside_px = seen.in_camera[:, 0], seen.outside_px[:, 0]
+        place = seen.in_camera[:, 0]
+        outside_px = seen.outside_px[:, 0]
         by_place = seen.gradient(rig)[:, 0]
         views = np.arange(len(rig.K))
         J = np.zeros((*outside_px.shape, len(views), CAMERA))
         J[:, views, views] = _by_camera(place, by_place)
         # The line starts in its own camera, which moves the place itself, the other way.
-        ray, points, own = sight.rays(rig), np.arange(len(depth)), sight.view
+        ray = sight.rays(rig)
+        points = np.arange(len(depth))
+        own = sight.view
         by_own = np.einsum("pvi,vij,pkj->pvk", by_place, rig.R, rig.R[own])
         J[points, :, own] -= _by_camera((ray * depth[:, None])[:, None], by_own)
         weight = (1 + (outside_px / OUTLIER_PX) ** 2) ** -0.25
@@ -246,7 +262,8 @@ class HeldOutIou:
 
 def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float) -> HeldOutIou:
     """Refine all cameras but one, and look at the hull through that one."""
-    others, held = [frame.without([name]) for frame in frames], [frame.select([name]) for frame in frames]
+    others = [frame.without([name]) for frame in frames]
+    held = [frame.select([name]) for frame in frames]
     refined = refined_all(others, bounds, hold).cameras
     before, after = (_iou(others, held, cameras, bounds) for cameras in (others[0].cameras, refined))
     return HeldOutIou(name, before, after)

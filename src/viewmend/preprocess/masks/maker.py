@@ -35,7 +35,8 @@ class MaskMaker(Protocol):
 def demand_size(rgb: Rgb, expected: np.ndarray, what: str) -> None:
     """ValueError unless an image has the height and width of `expected`, which messages call `what`."""
     if rgb.shape[:2] != expected.shape[:2]:
-        (h, w), (height, width) = rgb.shape[:2], expected.shape[:2]
+        h, w = rgb.shape[:2]
+        height, width = expected.shape[:2]
         raise ValueError(f"expected an image of {width} x {height} pixels as {what} has, got {w} x {h}; resize it")
 
 
@@ -58,7 +59,8 @@ def soft_mask(distance: Values, sure: float, possible: float) -> Mask:
 def _connected(possible: Inside, sure: Inside) -> Inside:
     """The parts of `possible` that have anything `sure` in them."""
     count, found = cv2.connectedComponents(possible.view(np.uint8), connectivity=8)
-    labels, kept = np.asarray(found, np.int32), np.zeros(count, bool)
+    labels = np.asarray(found, np.int32)
+    kept = np.zeros(count, bool)
     kept[labels[sure & possible]] = True
     kept[0] = False
     return kept[labels]
@@ -89,8 +91,10 @@ def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
 
 KEYS = {"green": 1, "blue": 2}
 """The channel that a screen of this colour is brightest in."""
-SURE, POSSIBLE = 0.5, 0.3
-"""How far from the key's colour foreground is, as a share of the key's own excess."""
+SURE = 0.5
+"""Pixels this far from the key's colour are foreground, as a share of the key's own excess."""
+POSSIBLE = 0.3
+"""Pixels this far from the key's colour are foreground where they touch sure ones, as a share of its excess."""
 DARK = 24
 """A key that is darker than this, in levels, is black: what is brighter is foreground."""
 EDGE = 1 / 100

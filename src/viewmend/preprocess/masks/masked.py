@@ -52,7 +52,8 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
     there = [view for view in range(len(cameras)) if bool((small[view] > FOREGROUND).any())]
     for view, size_px in enumerate(cameras.size_px.tolist()):
         others = [other for other in there if other != view]
-        groups, seen = max(1, len(others) // GROUP), []
+        groups = max(1, len(others) // GROUP)
+        seen = []
         for group in (others[first::groups] for first in range(groups if len(others) > 1 else 0)):
             hull = reconstruct(small[group], small_cameras[group], bounds)
             seen.append(hull.depth(small_cameras[view])[0].numpy() > 0)
@@ -114,7 +115,8 @@ class MaskedCapture(CaptureWrapper):
         around = range(max(time - reach, 0), min(time + reach + 1, len(self.frame_ids)))
         self._near = {t: self._near[t] if t in self._near else self._made(t) for t in around}
         frame = self._near.get(time) or self._made(time)
-        mask, cameras = _mask_of(frame), frame.cameras
+        mask = _mask_of(frame)
+        cameras = frame.cameras
         if self.clean_up == "parts":
             frame = replace(frame, mask=_supported_parts(mask, cameras, self.bounds))
         elif self.clean_up == "pixels":

@@ -12,8 +12,10 @@ PLATE_INPUTS = ("bgr", "background")
 """Names by which a network asks for the clean plate; "bgr" is BackgroundMattingV2's."""
 ALPHA_OUTPUTS = ("pha", "alpha", "matte", "output", "mask")
 """Names by which the matte is found; else it is the first output with one channel."""
-MODNET_PX, MODNET_STEP = 512, 32
-"""What free sizes are brought to: the shorter side, and what both are a multiple of."""
+MODNET_PX = 512
+"""Images are resized to this shorter side, pixels, for networks of any input size."""
+MODNET_STEP = 32
+"""Both sides are then a multiple of this many pixels."""
 
 
 class NetworkMasks:
@@ -35,7 +37,9 @@ class NetworkMasks:
             raise ValueError(f"{file}: expected {expected}, got {shapes}; export it so")
         if self._plate_name is not None and plate is None:
             raise ValueError(f"{file}: expected clean plates for this network, got none; give --plate")
-        self._file, self._image, self._plate = file, images[0], plate
+        self._file = file
+        self._image = images[0]
+        self._plate = plate
 
     def mask(self, rgb: Rgb) -> Mask:
         """Foreground of an image, 0 to 255; ValueError for another size than the plate's, or without a matte."""

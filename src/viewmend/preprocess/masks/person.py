@@ -19,8 +19,10 @@ from jaxtyping import Float32
 from viewmend.preprocess.masks.maker import Mask, Rgb
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "person"
-DETECTOR_PX, SEGMENTER_PX = 224, 256
-"""Input sizes of the networks."""
+DETECTOR_PX = 224
+"""The input of the detector has this side, pixels."""
+SEGMENTER_PX = 256
+"""The input of the segmenter has this side, pixels."""
 MAX_PEOPLE = 6
 """People per image; of more, those that the detector is surest of."""
 MIN_SCORE = 0.5
@@ -48,13 +50,16 @@ class Roi:
     @classmethod
     def around(cls, center: Sequence[float], top: Sequence[float]) -> "Roi":
         """The square of the circle about `center` through `top`, a point in the direction of the head."""
-        dx, dy = top[0] - center[0], top[1] - center[1]
+        dx = top[0] - center[0]
+        dy = top[1] - center[1]
         return cls(center[0], center[1], 2 * ROI_SCALE * math.hypot(dx, dy), math.atan2(dx, -dy))
 
     def image_from_roi(self) -> Float32[np.ndarray, "2 3"]:
         """Affine map from pixels of the segmenter's input (corner origin) to pixels of the image."""
         scale = self.side / SEGMENTER_PX
-        c, s, half = scale * math.cos(self.angle), scale * math.sin(self.angle), SEGMENTER_PX / 2
+        c = scale * math.cos(self.angle)
+        s = scale * math.sin(self.angle)
+        half = SEGMENTER_PX / 2
         return np.array([[c, -s, self.x - half * (c - s)], [s, c, self.y - half * (s + c)]], np.float32)
 
 
@@ -164,7 +169,8 @@ def _anchors() -> Float32[np.ndarray, "2254 2"]:
 
 def _iou(a: np.ndarray, b: np.ndarray) -> float:
     """Overlap of two boxes, each a centre and a size."""
-    low, high = np.maximum(a[0] - a[1] / 2, b[0] - b[1] / 2), np.minimum(a[0] + a[1] / 2, b[0] + b[1] / 2)
+    low = np.maximum(a[0] - a[1] / 2, b[0] - b[1] / 2)
+    high = np.minimum(a[0] + a[1] / 2, b[0] + b[1] / 2)
     both = float(np.prod(np.clip(high - low, 0, None)))
     return both / max(float(np.prod(a[1]) + np.prod(b[1])) - both, 1e-6)
 

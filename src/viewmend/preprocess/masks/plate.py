@@ -7,17 +7,19 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from viewmend.data.capture_folder import CaptureFolder
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats.files import match_names
 from viewmend.data.images import read_rgb
-from viewmend.data.native_capture import NativeCapture
 from viewmend.data.source import CaptureSource
 from viewmend.data.videos import VideoFile, is_video, video_properties
 from viewmend.preprocess.masks.maker import Colours, Mask, Rgb, Values, demand_size, soft_mask
 from viewmend.preprocess.masks.masked import view_rgb
 
-SURE, POSSIBLE = 28.0, 14.0
-"""Distances in CIELAB (L from 0 to 255) that are foreground for sure, and where they hang together with sure ones."""
+SURE = 28.0
+"""Pixels that differ from the plate by this distance in CIELAB (L from 0 to 255) are foreground."""
+POSSIBLE = 14.0
+"""Pixels that differ from the plate by this distance are foreground where they are connected to sure ones."""
 DEEPEST_SHADOW = 0.6
 """How much of the plate's brightness the deepest shadow leaves."""
 SHADOW_COST = 0.1
@@ -43,7 +45,8 @@ class PlateMasks:
         image = _smooth(rgb)
         image = np.minimum(image * exposure_gain(image, self._plate), 1)
         lit = (_dot(image, self._plate) / self._square).clip(DEEPEST_SHADOW, 1).astype(np.float32)
-        shaded, lab = _lab(self._plate * lit[..., None]), _lab(image)
+        shaded = _lab(self._plate * lit[..., None])
+        lab = _lab(image)
         as_shadow = _length(lab - shaded) + SHADOW_COST * (self._lab[..., 0] - shaded[..., 0])
         return soft_mask(np.minimum(as_shadow, _length(lab - self._lab)), SURE, POSSIBLE)
 
@@ -58,7 +61,8 @@ def median_plate(images: Iterable[Rgb]) -> Rgb:
 
 def exposure_gain(image: Colours, plate: Colours) -> Float32[np.ndarray, "3"]:
     """Factors of an image's channels that make it as bright as its plate: medians, since most of it is background."""
-    image, plate = image[::4, ::4], plate[::4, ::4]
+    image = image[::4, ::4]
+    plate = plate[::4, ::4]
     usable = ((image > 0.05) & (image < 0.95) & (plate > 0.05) & (plate < 0.95)).all(-1)
     if usable.mean() < 0.05:
         return np.ones(3, np.float32)
@@ -91,7 +95,7 @@ MOST_FRAMES = 25
 """Maximum number of frames for the median, evenly spread."""
 
 
-def plates_from_files(capture: NativeCapture, place: str) -> dict[str, Rgb]:
+def plates_from_files(capture: CaptureFolder, place: str) -> dict[str, Rgb]:
     """The plate of each camera, undistorted: `place` is a path with `{camera}`, or a folder of files named after them.
 
     Of a video the median is taken. CaptureError if a camera has no plate that can be read and is of its images' size.

@@ -68,7 +68,8 @@ class Torso:
     def radius(self, azimuth: Values, y: Values) -> Values:
         """Distance of the surface from the axis; azimuth 0 is the front, a quarter turn the left."""
         a, f, b = (np.interp(y, self.y, table) for table in (self.width, self.front, self.back))
-        sine, cosine = np.abs(np.sin(azimuth)), np.cos(azimuth)
+        sine = np.abs(np.sin(azimuth))
+        cosine = np.cos(azimuth)
         depth = np.where(cosine > 0, f, b)
         r = ((sine / a) ** 2.4 + (np.abs(cosine) / depth) ** 2.4) ** (-1 / 2.4)
         for place, height, spread, tall, swell in self.bumps:
@@ -84,7 +85,8 @@ class Torso:
 
     def field(self, points: Points) -> Values:
         """Distance to the surface to first order, negative inside."""
-        x, y = points[..., 0], points[..., 1]
+        x = points[..., 0]
+        y = points[..., 1]
         z = points[..., 2] - np.interp(y, self.y, self.z)
         clamped = np.clip(y, self.y[0], self.y[-1])
         slope = np.interp(y, self.y, np.gradient(self.width, self.y))
@@ -205,7 +207,9 @@ def opposite(part: int) -> list[int]:
 
 def build_body(person: Physique, skeleton: Skeleton) -> Body:
     """The naked shape of this person in the bind pose (head, hands and feet are drawn elsewhere)."""
-    H, f, w = person.height_m, person.femininity, person.weight
+    H = person.height_m
+    f = person.femininity
+    w = person.weight
     y, a_m, a_f, d_m, d_f, back, z = TORSO.T
     belly = np.exp(-(((y - 0.605) / 0.065) ** 2)) * np.where(w > 0, 1.0, 0.35)
     trunk = np.clip((0.85 - y) / 0.05, 0, 1)
@@ -225,7 +229,8 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
         t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth * H, H]))
         return tuple(Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES)
 
-    arms, legs = pair("upperarm", "hand", ARM_PROFILE, girth), pair("thigh", "foot", LEG_PROFILE, leg_girth)
+    arms = pair("upperarm", "hand", ARM_PROFILE, girth)
+    legs = pair("thigh", "foot", LEG_PROFILE, leg_girth)
     return Body(torso, arms, legs, skeleton, H)
 
 
@@ -273,7 +278,8 @@ def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
     shape = points.shape[:-1]
     weights = one_joint(shape, "pelvis")
     for name, half in zip(SPINE[1:], (0.035, 0.04, 0.04, 0.018, 0.016), strict=True):
-        y, soft = float(skeleton.at(name)[1]), half * height_m
+        y = float(skeleton.at(name)[1])
+        soft = half * height_m
         weights = mix(weights, one_joint(shape, name), smoothstep(points[..., 1], y - soft, y + soft))
     for side in SIDES:
         outer = float(skeleton.at(f"{side}_upperarm")[0])
@@ -307,7 +313,8 @@ def hand_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch
     H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
     wrist = body.skeleton.at(f"{side}_hand")
-    along, forward = -arm.frame[1], arm.frame[2]
+    along = -arm.frame[1]
+    forward = arm.frame[2]
     palm = np.cross(along, forward) * SIGN[side]
     s = np.linspace(1, -0.12, 12)
     reach = 0.054 * H * s
@@ -348,11 +355,13 @@ def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Pa
     phi = np.linspace(0, 2 * np.pi, 29)
     sole = 0.009 * H
     # The upper is round, the sole a box with soft corners; phi runs from the outer side over the top.
-    cosine, sine = np.cos(phi), np.sin(phi)
+    cosine = np.cos(phi)
+    sine = np.sin(phi)
     x = half[:, None] * np.sign(cosine) * np.abs(cosine) ** np.where(sine > 0, 0.85, 0.35)
     y = np.where(sine > 0, sole + (tall - sole)[:, None] * np.abs(sine) ** 0.9, sole * (1 - np.abs(sine) ** 0.35))
     # Heel and tip close to a point just above the floor.
-    middle, close = 0.006 * H, np.clip(half / (0.012 * H), 0, 1)[:, None]
+    middle = 0.006 * H
+    close = np.clip(half / (0.012 * H), 0, 1)[:, None]
     y = middle + (y - middle) * close
     z = np.broadcast_to(((s - 0.25) * 0.152 * H)[:, None], x.shape)
     splay = SIGN[side] * 0.04 * H * np.maximum(s - 0.25, 0)[:, None] * 0.7

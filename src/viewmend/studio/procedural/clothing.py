@@ -55,7 +55,8 @@ class Folds:
         """Displacement at places of the canvas, metres."""
         height = self.height(canvas).astype(np.float32)
         rows, columns = height.shape
-        x, y = uv[..., 0] * (columns - 1), (1 - uv[..., 1]) * (rows - 1)
+        x = uv[..., 0] * (columns - 1)
+        y = (1 - uv[..., 1]) * (rows - 1)
         return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(np.float64)
 
     def paint(self, canvas: Canvas, painter: Painter) -> Image:
@@ -92,12 +93,14 @@ def torso_sheet(
     rows: int = 44,
 ) -> Patch:
     """The torso of `shape` between the heights `low` and `high` (metres, per azimuth), with lips turned inwards."""
-    torso, arc = shape.torso, shape.torso.arc
+    torso = shape.torso
+    arc = shape.torso.arc
     s_low, s_high = (np.interp(edge, torso.y, arc) for edge in (low, high))
     s = s_low + np.linspace(0, 1, rows)[:, None] * (s_high - s_low)
     y = np.interp(s, arc, torso.y)
     theta = np.broadcast_to(around, s.shape)
-    bottom, top = float(s_low.min()), float(s_high.max())
+    bottom = float(s_low.min())
+    top = float(s_high.max())
     middle = float(np.interp((bottom + top) / 2, arc, torso.y))
     ring = torso.point(around, np.full_like(around, middle))
     girth = float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum())
@@ -141,7 +144,8 @@ def limb_sheet(
     points = shape.settle(on_limb, outward, part) + folds.crease(canvas, uv)[..., None] * outward
     center = naked.center(t[0])
     lip = center + 0.8 * (naked.point(theta, t[0]) - center) + 0.004 * limb.frame[1]
-    points, uv = np.concatenate([lip[None], points]), np.concatenate([uv[:1], uv])
+    points = np.concatenate([lip[None], points])
+    uv = np.concatenate([uv[:1], uv])
     return Patch(points, uv, body_weights(body, points, part), folds.paint(canvas, painter))
 
 
@@ -151,8 +155,10 @@ def skirt_weights(body: Body, points: Points, around: Values) -> Weights:
     column = (around / (2 * np.pi) * SKIRT_COLUMNS) % SKIRT_COLUMNS
     first = np.floor(column).astype(int) % SKIRT_COLUMNS
     share = column - np.floor(column)
-    y, soft = points[..., 1], 0.03 * body.height_m
-    sheets, steps = [], []
+    y = points[..., 1]
+    soft = 0.03 * body.height_m
+    sheets = []
+    steps = []
     for segment in ("low", "high"):
         dense = np.zeros((*shape, len(INDEX)))
         index = np.array([INDEX[f"skirt{c}_{segment}"] for c in range(SKIRT_COLUMNS)])
@@ -313,7 +319,8 @@ class Tailor:
 
     def lower_shape(self) -> Body:
         """The body in what covers the legs."""
-        body, cut = self.body, self.cut
+        body = self.body
+        cut = self.cut
         legs = tuple(leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs)
         return replace(body, torso=body.torso.eased(min(cut.ease_m, 0.006) - 0.001), legs=legs)
 
@@ -323,7 +330,10 @@ class Tailor:
 
     def top(self) -> list[Patch]:
         """Shirt, sweater or the like: trunk and sleeves."""
-        H, outfit, body, cut = self.body.height_m, self.outfit, self.body, self.cut
+        H = self.body.height_m
+        outfit = self.outfit
+        body = self.body
+        cut = self.cut
         lower = self.lower_shape()
         hang, flare = (0.10, 0.012) if cut.sleeve < 0.7 else (0.62, -0.006)
         arms = tuple(arm.eased(cut.loose_m + 0.003, hang, flare) for arm in body.arms)
@@ -366,7 +376,9 @@ class Tailor:
 
     def bottom(self) -> list[Patch]:
         """Trousers, shorts or skirt."""
-        H, cut, kind = self.body.height_m, self.cut, self.outfit.bottom
+        H = self.body.height_m
+        cut = self.cut
+        kind = self.outfit.bottom
         if kind in ("skirt", "dress"):
             return self._skirt()
         shape = self.lower_shape()
@@ -402,10 +414,13 @@ class Tailor:
         return blend(image, 0.75 * image, edge(0.0014 - np.abs(canvas.y - 0.025), canvas))
 
     def _skirt(self) -> list[Patch]:
-        H, outfit, body = self.body.height_m, self.outfit, self.body
+        H = self.body.height_m
+        outfit = self.outfit
+        body = self.body
         rng = np.random.default_rng(outfit.seed + 1)
         fabric = outfit.fabrics[0 if outfit.bottom == "dress" else 1]
-        hem, flare = float(rng.uniform(0.17, 0.36)), float(rng.uniform(0.14, 0.42))
+        hem = float(rng.uniform(0.17, 0.36))
+        flare = float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
         shape = replace(body, torso=body.torso.eased(0.014))
         waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
@@ -413,7 +428,9 @@ class Tailor:
 
     def outer(self) -> list[Patch]:
         """Jacket or coat, open in front."""
-        H, outfit, body = self.body.height_m, self.outfit, self.body
+        H = self.body.height_m
+        outfit = self.outfit
+        body = self.body
         if outfit.outer == "none":
             return []
         rng = np.random.default_rng(outfit.seed + 2)
@@ -422,9 +439,11 @@ class Tailor:
         torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
         shape = replace(body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms))
         around = azimuths(65, float(rng.uniform(0.12, 0.4)))
-        coat, cloth = outfit.outer == "coat", outfit.fabrics[2].paint
+        coat = outfit.outer == "coat"
+        cloth = outfit.fabrics[2].paint
         hem = 0.535 if coat else float(rng.uniform(0.50, 0.55))
-        low, high = np.full_like(around, hem * H), neckline(around, H, 0.05, vee=True)
+        low = np.full_like(around, hem * H)
+        high = neckline(around, H, 0.05, vee=True)
         folds = self.folds(0.0025, 0.09, 0.14, 5)
         trunk = torso_sheet(self.body, shape, low, high, around, self._paint_outer, folds)
         sleeves = [limb_sheet(self.body, shape, part, -0.03, 0.97, cloth, folds) for part in (1, 2)]
@@ -442,22 +461,27 @@ class Tailor:
 
     def skin(self, person: Physique, rng: np.random.Generator) -> list[Patch]:
         """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
-        H, body, cut = person.height_m, self.body, self.cut
+        H = person.height_m
+        body = self.body
+        cut = self.cut
 
         def paint(canvas: Canvas) -> Image:
             tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
             return np.clip(np.array(person.skin_rgb) * tone[..., None], 0, 1)
 
         around = azimuths(49)
-        low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
+        low = np.full_like(around, 0.73 * H)
+        high = np.full_like(around, 0.893 * H)
         patches = [torso_sheet(body, body, low, high, around, paint, rows=24)]
         # Cloth covers what lies further in than a hand's breadth from its hem.
-        arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
+        arm = max(cut.cuff - 0.15, -0.03)
+        leg = max(cut.leg - 0.12, 0.0)
         grids = (8 + int(24 * (1 - arm)), 21), (8 + int(28 * (1 - leg)), 25)
         for i in (0, 1):
             patches.append(limb_sheet(body, body, 1 + i, arm, 1.0, paint, grid=grids[0]))
             patches.append(limb_sheet(body, body, 3 + i, leg, 1.04, paint, grid=grids[1]))
-        skin, girth = paint(Canvas(0.1, 0.1)), 1.05 - 0.13 * person.femininity + 0.05 * person.weight
+        skin = paint(Canvas(0.1, 0.1))
+        girth = 1.05 - 0.13 * person.femininity + 0.05 * person.weight
         for side in SIDES:
             patches += hand_patches(body, side, skin, girth)
         return patches

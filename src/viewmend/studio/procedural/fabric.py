@@ -121,7 +121,10 @@ def wave(position_m: Plane, period_m: float, share: float, canvas: Canvas) -> Pl
 
 def _woven(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
     """Cloth whose pattern is that of its threads, painted on an image of its first colour."""
-    x, y, period, (_, second, third) = canvas.x, canvas.y, fabric.period_m, fabric.colors
+    x = canvas.x
+    y = canvas.y
+    period = fabric.period_m
+    _, second, third = fabric.colors
     match fabric.kind:
         case "heather":
             grain = 0.10 * canvas.noise(rng, 0.006, 0.002) + 0.05 * canvas.noise(rng, 0.02, 0.004)
@@ -150,7 +153,10 @@ def _woven(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generato
 
 def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
     """Cloth with a print on an image of its first colour."""
-    x, y, period, (_, second, third) = canvas.x, canvas.y, fabric.period_m, fabric.colors
+    x = canvas.x
+    y = canvas.y
+    period = fabric.period_m
+    _, second, third = fabric.colors
     match fabric.kind:
         case "bands":
             low, high = sorted(rng.uniform(0.25, 0.85, 2) * canvas.height_m)
@@ -176,7 +182,8 @@ def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
             image = blend(image, second, wave(y + fold, period, 0.4, canvas))
             image = blend(image, third, wave(y + fold + 0.4 * period, period, 0.12, canvas))
         case "letters":
-            step, word = 0.13, WORDS[int(rng.integers(len(WORDS)))]
+            step = 0.13
+            word = WORDS[int(rng.integers(len(WORDS)))]
             for row, top in enumerate(np.arange(step / 2, canvas.height_m, step)):
                 for left in np.arange(-(row % 2) * step - canvas.width_m / 2, canvas.width_m / 2, 1.9 * step):
                     image = write(image, canvas, word, second, (left + step, top), 0.8 * step)
@@ -191,21 +198,25 @@ def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
     palette = [fabric.colors[1], fabric.colors[2], hsv(0.32, 0.5, 0.4)]
     for _ in range(max(int(rows * columns / (2.6 * size) ** 2 * 1.6), 3)):
         center = rng.uniform(0, 1, 2) * (columns, rows)
-        turn, scale = rng.uniform(0, 6.3), size * rng.uniform(0.5, 1.1)
-        color, petals = (255 * palette[int(rng.integers(3))]).tolist(), int(rng.integers(4, 7))
+        turn = rng.uniform(0, 6.3)
+        scale = size * rng.uniform(0.5, 1.1)
+        color = (255 * palette[int(rng.integers(3))]).tolist()
+        petals = int(rng.integers(4, 7))
         for k in range(petals):
             angle = turn + 2 * np.pi * k / petals
             x, y = center + 0.55 * scale * np.array([np.cos(angle), np.sin(angle)])
             axes = (max(1, int(0.45 * scale)), max(1, int(0.25 * scale)))
             cv2.ellipse(flat, (int(x), int(y)), axes, np.degrees(angle), 0, 360, color, -1, cv2.LINE_AA)
-        middle, radius = (int(center[0]), int(center[1])), max(1, int(0.22 * scale))
+        middle = (int(center[0]), int(center[1]))
+        radius = max(1, int(0.22 * scale))
         cv2.circle(flat, middle, radius, (240, 200, 50), -1, cv2.LINE_AA)
     return flat / 255.0
 
 
 def write(image: Image, canvas: Canvas, word: str, color: Vector, at_m: tuple[float, float], width_m: float) -> Image:
     """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
-    font, thick = cv2.FONT_HERSHEY_DUPLEX, max(2, round(0.05 * width_m * canvas.px_per_m))
+    font = cv2.FONT_HERSHEY_DUPLEX
+    thick = max(2, round(0.05 * width_m * canvas.px_per_m))
     (wide, tall), _ = cv2.getTextSize(word, font, 1.0, 1)
     scale = min(width_m * canvas.px_per_m / wide, 0.09 * canvas.px_per_m / tall)
     left = int((at_m[0] + canvas.width_m / 2) * canvas.px_per_m - scale * wide / 2)
@@ -250,7 +261,10 @@ def assemble(patches: list[Patch]) -> BoundMesh:
     """One mesh and one atlas out of all patches."""
     offsets, atlas = pack_charts([patch.chart for patch in patches])
     height, width = atlas.shape[:2]
-    faces, normals, uvs, first = [], [], [], 0
+    faces = []
+    normals = []
+    uvs = []
+    first = 0
     for patch, (left, top) in zip(patches, offsets, strict=True):
         triangles = _shown_faces(patch)
         normals.append(_grid_normals(patch, triangles).reshape(-1, 3))
@@ -317,9 +331,12 @@ def pack_charts(charts: list[Float[np.ndarray, "_ _ 3"]]) -> tuple[list[tuple[in
     for i in sorted(range(len(charts)), key=lambda i: (-sizes[i][1], i)):
         w, h = sizes[i]
         if left + w > width:
-            left, top, shelf = 0, top + shelf, 0
+            left = 0
+            top = top + shelf
+            shelf = 0
         offsets[i] = (left + gutter, top + gutter)
-        left, shelf = left + w, max(shelf, h)
+        left = left + w
+        shelf = max(shelf, h)
     atlas = np.zeros((top + shelf, width, 3), dtype=np.float32)
     for chart, (x, y) in zip(charts, offsets, strict=True):
         framed = np.pad(chart, ((gutter, gutter), (gutter, gutter), (0, 0)), mode="edge")

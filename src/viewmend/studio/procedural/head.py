@@ -12,7 +12,10 @@ from viewmend.studio.procedural.skeleton import TABLES, Physique, Points, Skelet
 RINGS = np.array(TABLES["head"])
 HEAD_SHARE = 0.132
 """The head's height as a share of the person's (7.6 heads)."""
-EYE_AZIMUTH, EYE_Y = 0.37, 0.495
+EYE_AZIMUTH = 0.37
+"""The eyes are at this angle from the middle of the face, radians, to either side."""
+EYE_Y = 0.495
+"""The eyes are at this share of the head's height."""
 
 
 def _spot(turn: Values, y: Values, at: float, height: float, wide: float, tall: float) -> Values:
@@ -31,13 +34,15 @@ class Head:
 
     def radius(self, azimuth: Values, y: Values) -> Values:
         """Horizontal distance from the axis in head heights, with the face's features."""
-        f, face = self.person.femininity, self.person.face
+        f = self.person.femininity
+        face = self.person.face
         heights, rings = smooth_table(RINGS[:, 0], RINGS[:, 1:])
         close = np.sqrt(np.clip((1 - y) / 0.03, 0, 1))
         a, d, b = (np.interp(y, heights, rings[:, k]) * close for k in range(3))
         jaw = np.exp(-(((y - 0.12) / 0.14) ** 2))
         a = a * (1 + jaw * (0.05 - 0.10 * f + 0.05 * face[0]) + 0.04 * self.person.weight * jaw)
-        sine, cosine = np.abs(np.sin(azimuth)), np.cos(azimuth)
+        sine = np.abs(np.sin(azimuth))
+        cosine = np.cos(azimuth)
         depth = np.maximum(np.where(cosine > 0, d, b), 1e-3)
         r = ((sine / np.maximum(a, 1e-3)) ** 2.25 + (np.abs(cosine) / depth) ** 2.25) ** (-1 / 2.25)
         turn = np.abs(np.angle(np.exp(1j * azimuth)))
@@ -102,9 +107,12 @@ def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rg
 
 def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_rgb: Vector) -> Image:
     """Skin with eyes, brows, mouth, cheeks, nostrils, and stubble on some."""
-    theta, y = canvas.x / canvas.width_m * 2 * np.pi, canvas.y / canvas.height_m
+    theta = canvas.x / canvas.width_m * 2 * np.pi
+    y = canvas.y / canvas.height_m
     turn = np.abs(theta)
-    skin, face, f = np.array(person.skin_rgb), person.face, person.femininity
+    skin = np.array(person.skin_rgb)
+    face = person.face
+    f = person.femininity
     mottled = 1 + 0.02 * canvas.noise(rng, 0.012, 0.012) + 0.012 * canvas.noise(rng, 0.003, 0.003)
     image = skin * mottled[..., None]
 
@@ -160,7 +168,8 @@ class Hair:
 
 def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) -> Hair:
     """Draw a hairstyle; colours over the human range, dark ones on dark skin."""
-    styles, odds = list(TABLES["hair"]), [row[femininity > 0.5] for row in TABLES["hair"].values()]
+    styles = list(TABLES["hair"])
+    odds = [row[femininity > 0.5] for row in TABLES["hair"].values()]
     style = styles[int(rng.choice(len(styles), p=odds))]
     colors = np.array([*TABLES["hair_colors"], (rng.random(), 0.6, 0.6, 0.03, 0.02)])
     h, s, v = colors[int(rng.choice(len(colors), p=colors[:, 4 if dark_skin else 3])), :3]
@@ -249,7 +258,8 @@ def _tied(head: Head, hair: Hair, chart: Image) -> Patch:
     s = 1 - v
     length = head.size_m * (0.9 + 1.0 * hair.volume)
     radius = 0.10 * head.size_m * np.sqrt(np.clip(s * 6, 0, 1)) * np.interp(s, [0, 0.1, 0.5, 1], [0.55, 0.9, 1, 0.05])
-    drop, back = -length * s + 0.03 * np.sin(np.pi * s), -0.09 * np.sin(np.minimum(s * 3, 1.57))
+    drop = -length * s + 0.03 * np.sin(np.pi * s)
+    back = -0.09 * np.sin(np.minimum(s * 3, 1.57))
     ring = np.stack([radius * np.sin(phi), np.zeros_like(s), radius * np.cos(phi)], -1)
     points = start + np.stack([np.zeros_like(s), drop, back], -1) + ring
     return Patch(points, uv, one_joint(v.shape, "tail"), chart)
@@ -259,7 +269,8 @@ def _brim(head: Head, chart: Image) -> Patch:
     """The peak of a cap."""
     phi, v = np.meshgrid(np.linspace(-np.pi, np.pi, 33), np.linspace(-1, 1, 9))
     across = np.sqrt(np.clip(1 - v**2, 0, 1))
-    x, z = 0.31 * np.sin(phi) * across, 0.33 + 0.42 * np.cos(phi) * across
+    x = 0.31 * np.sin(phi) * across
+    z = 0.33 + 0.42 * np.cos(phi) * across
     at = np.stack([x, 0.70 + 0.016 * v - 0.25 * x**2 - 0.10 * (z - 0.33), z], -1)
     uv = np.stack([(phi / np.pi + 1) / 2, (v + 1) / 2], -1)
     return Patch(head.origin + head.size_m * at, uv, one_joint(v.shape, "head"), chart)

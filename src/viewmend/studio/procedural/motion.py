@@ -78,7 +78,8 @@ def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
 
 def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     """Feet that step along the path: planted, lifted, swung to where the body will be."""
-    H, run = score.height_m, score.kind == "run"
+    H = score.height_m
+    run = score.kind == "run"
     duty = 0.42 if run else 0.62
     lift = {"run": 0.13, "march": 0.17, "walk": 0.045}.get(score.kind, 0.05) * H
     width = 0.10 if score.kind != "sidestep" else 0.16
@@ -86,7 +87,8 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     feet = []
     for i, side in enumerate(SIDES):
         phase = beats + 0.5 * i
-        step, tau = int(np.floor(phase)), float(phase - np.floor(phase))
+        step = int(np.floor(phase))
+        tau = float(phase - np.floor(phase))
         planted = []
         for k in (step, step + 1):
             when = time_s + (k + duty / 2 - phase) / score.beat_hz
@@ -121,7 +123,8 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
 
 def _standing(score: Score, time_s: float, beats: float) -> Stance:
     """Talking or swaying: planted feet, weight that shifts, breath."""
-    a, H = score.amounts, score.height_m
+    a = score.amounts
+    H = score.height_m
     calm = score.tempo == "calm"
     strong = {"talk": 0.5, "sway": 1.0, "groove": 1.3, "box": 0.8, "lunge": 1.0}[score.kind]
     base = score.rest(0.14 + 0.10 * a[0] * strong, 0.015 + 0.02 * strong)
@@ -129,9 +132,11 @@ def _standing(score: Score, time_s: float, beats: float) -> Stance:
     shift = (0.020 + 0.022 * a[1]) * strong * np.sin(beat / 2 if not calm else beat)
     dip = 0.0 if calm else (0.018 + 0.02 * a[2]) * (1 - np.cos(beat * 1.0)) * strong
     if score.kind == "lunge":
-        shift, dip = 2.6 * shift, 1.2 * dip + 0.05
+        shift = 2.6 * shift
+        dip = 1.2 * dip + 0.05
     move = score.turn @ np.array([shift, 0, 0.3 * shift * np.cos(beat / 2)])
-    s, c = float(np.sin(beat / 2 if not calm else beat)), float(np.cos(beat / 2))
+    s = float(np.sin(beat / 2 if not calm else beat))
+    c = float(np.cos(beat / 2))
     heel = -0.35 * strong * (not calm) * np.clip(np.array([-s, s]), 0, 1) ** 2
     feet = [replace(foot, pitch=float(h)) for foot, h in zip(base.feet, heel, strict=True)]
     return replace(
@@ -162,7 +167,8 @@ def _jumping(score: Score, time_s: float, beats: float) -> Stance:
 
 def _crouching(score: Score, time_s: float, beats: float) -> Stance:
     """Down on bent knees and up again."""
-    H, a = score.height_m, score.amounts
+    H = score.height_m
+    a = score.amounts
     base = score.rest(0.16 + 0.06 * a[0], 0.015)
     low = ease(0.5 - 0.5 * np.cos(2 * np.pi * 0.5 * beats)) * (0.75 + 0.25 * a[1])
     back = score.turn @ np.array([0, 0, -0.07 * low * H])
@@ -183,7 +189,8 @@ SEAT = 0.262
 
 def _sitting(score: Score, time_s: float, beats: float) -> Stance:
     """Sitting on a stool at the centre; some get up and sit down again."""
-    H, a = score.height_m, score.amounts
+    H = score.height_m
+    a = score.amounts
     forward = score.turn @ np.array([0, 0, 1.0])
     base = score.rest(0.13 + 0.06 * a[0], 0.01, 0.21 * H)
     seated = np.array([0, SEAT * H + 0.062 * H, 0]) - 0.02 * H * forward
@@ -205,9 +212,11 @@ def _sitting(score: Score, time_s: float, beats: float) -> Stance:
 
 def _reaching(score: Score, time_s: float, beats: float) -> Stance:
     """Hands that go from one place to the next: up, aside, forward, to the floor."""
-    H, a = score.height_m, score.amounts
+    H = score.height_m
+    a = score.amounts
     base = score.rest(0.18, 0.03)
-    step, tau = int(np.floor(beats)), float(beats - np.floor(beats))
+    step = int(np.floor(beats))
+    tau = float(beats - np.floor(beats))
     share = ease(tau / 0.7)
     goals = [_goal(score, step + k) for k in (0, 1)]
     goal = goals[0] + share * (goals[1] - goals[0])
@@ -230,10 +239,12 @@ def _reaching(score: Score, time_s: float, beats: float) -> Stance:
 def _goal(score: Score, step: int) -> Float[np.ndarray, "side 3"]:
     """Places of both wrists in the heading's frame, shares of the height; the hands often go together."""
     rng = np.random.default_rng([int(1e6 * score.amounts[5]), step % 1000])
-    places, down = np.array(TABLES["reaches"]), np.array([0.17, 0.47, 0.05])
+    places = np.array(TABLES["reaches"])
+    down = np.array([0.17, 0.47, 0.05])
     mirror = np.array([-1, 1, 1])
     chosen = rng.integers(0, len(places), 2)
-    left, right = places[chosen[0]], places[chosen[1 if rng.random() < 0.4 else 0]] * mirror
+    left = places[chosen[0]]
+    right = places[chosen[1 if rng.random() < 0.4 else 0]] * mirror
     if rng.random() < 0.4:
         right = down * mirror
     elif rng.random() < 0.4:
@@ -284,7 +295,8 @@ def sample_gesture(rng: np.random.Generator, kinds: list[str], bulk: float, ener
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
         names = (names[1], names[0])
-    phase, own = rng.random(), rng.uniform(0, 1, 4)
+    phase = rng.random()
+    own = rng.uniform(0, 1, 4)
     sides = []
     for i, name in enumerate(names):
         angles, harmonic, apart, curl = TABLES["gestures"][name]

@@ -32,7 +32,8 @@ class ProceduralPerson:
 
     def pose(self, time_s: float) -> TexturedMesh:
         """The person at this time, in seconds."""
-        now, before = self.motion.stance(time_s), self.motion.stance(time_s - LAG_S)
+        now = self.motion.stance(time_s)
+        before = self.motion.stance(time_s - LAG_S)
         transforms = torch.from_numpy(now.solve(self.skeleton, before, LAG_S)).float()
         return self.bound.posed(transforms)
 
@@ -58,7 +59,8 @@ def draw_person(
     patches += [shoe_patch(body, side, outfit.shoes[0], outfit.shoes[1]) for side in SIDES]
     held = ""
     if (prop_rng.random() < 0.3 if holding is None else holding) and motion.score.kind not in BUSY_HANDS:
-        thing, side = HELD[int(prop_rng.integers(len(HELD)))], SIDES[int(prop_rng.integers(2))]
+        thing = HELD[int(prop_rng.integers(len(HELD)))]
+        side = SIDES[int(prop_rng.integers(2))]
         patches += held_prop(thing, prop_rng, body, side)
         motion = replace(motion, grip=side)
         held = f" with a {thing}"
@@ -86,11 +88,15 @@ class ProceduralPerformer:
             parts.append(self.things)
         if len(parts) == 1:
             return parts[0]
-        first, layer, faces, textures = 0, 0, [], []
+        first = 0
+        layer = 0
+        faces = []
+        textures = []
         for part in parts:
             faces.append(part.mesh.faces + first)
             textures.append(part.texture_of_face + layer)
-            first, layer = first + len(part.mesh.vertices), layer + len(part.textures)
+            first = first + len(part.mesh.vertices)
+            layer = layer + len(part.textures)
         vertices, normals, uv = zip(*((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True)
         mesh = Mesh(torch.cat(vertices), torch.cat(faces))
         every = tuple(texture for part in parts for texture in part.textures)
@@ -156,7 +162,8 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
 
 def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
     """One or two things on the floor, off the line through two people."""
-    patches, names = [], []
+    patches = []
+    names = []
     for i in range(int(rng.integers(1, 3))):
         kind = STANDING[int(rng.integers(len(STANDING)))]
         turn = angle + np.pi / 2 + i * np.pi + rng.uniform(-0.6, 0.6)

@@ -35,7 +35,8 @@ class Frame:
 def turned_solid(frame: Frame, r: Values, y: Values, chart: Image, columns: int = 29) -> Patch:
     """A solid of revolution about y, from radii at heights that go up; repeated ones make sharp edges."""
     phi = np.linspace(-np.pi, np.pi, columns)
-    x, z = r[:, None] * np.sin(phi), r[:, None] * np.cos(phi)
+    x = r[:, None] * np.sin(phi)
+    z = r[:, None] * np.cos(phi)
     return frame.patch(np.stack([x, np.broadcast_to(y[:, None], x.shape), z], -1), chart)
 
 
@@ -59,7 +60,9 @@ def ball(frame: Frame, radius: float, chart: Image) -> Patch:
 
 def box(frame: Frame, size: tuple[float, float, float], chart: Image) -> list[Patch]:
     """Six sides, each with the whole chart; x and z are centred, y starts at 0."""
-    w, h, d = size[0] / 2, size[1], size[2] / 2
+    w = size[0] / 2
+    h = size[1]
+    d = size[2] / 2
     sides = []
     for k in range(4):
         wide, deep = (w, d) if k % 2 == 0 else (d, w)
@@ -138,11 +141,13 @@ def _plant(rng: np.random.Generator, frame: Frame) -> list[Patch]:
     canvas = Canvas(0.1, 0.3, 300.0)
     chart = np.clip(green * (1 + 0.12 * canvas.noise(rng, 0.02, 0.1))[..., None], 0, 1)
     for k in range(int(rng.integers(7, 12))):
-        tall, reach = rng.uniform(0.35, 0.8), rng.uniform(0.1, 0.34)
+        tall = rng.uniform(0.35, 0.8)
+        reach = rng.uniform(0.1, 0.34)
         wide = rng.uniform(0.03, 0.07) * np.sqrt(np.clip(np.sin(np.pi * np.clip(s, 0.02, 1)), 0, 1)) + 0.004
         turn = Frame(frame.origin, rotation(1, 2.4 * k))
         rise = 0.22 + tall * np.sin(s * 1.8) / np.sin(1.6)
-        x, z = wide * np.sin(phi), 0.02 + reach * s**1.5 + 0.006 * np.cos(phi)
+        x = wide * np.sin(phi)
+        z = 0.02 + reach * s**1.5 + 0.006 * np.cos(phi)
         patches.append(turn.patch(np.stack([x, rise, z], -1), chart))
     return patches
 
@@ -151,7 +156,8 @@ def held_prop(kind: str, rng: np.random.Generator, body: Body, side: str) -> lis
     """One of `HELD`, in the bind pose of this hand."""
     H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
-    along, forward = -arm.frame[1], arm.frame[2]
+    along = -arm.frame[1]
+    forward = arm.frame[2]
     palm = np.cross(along, forward) * SIGN[side]
     grip = body.skeleton.at(f"{side}_hand") + 0.058 * H * along + 0.024 * H * palm
     # The hand's own up is towards the thumb: a fist holds a stick that way.

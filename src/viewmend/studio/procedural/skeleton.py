@@ -48,9 +48,11 @@ SIGN = {"left": 1.0, "right": -1.0}
 
 def rotation(axis: int, angle_rad: float) -> Rotation:
     """Rotation about coordinate axis 0, 1 or 2."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     R = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
+    i = (axis + 1) % 3
+    j = (axis + 2) % 3
     R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
     return R
 
@@ -161,7 +163,8 @@ def build_skeleton(person: Physique) -> Skeleton:
         for part, (x, y, z) in zip(LEG, TABLES["leg_joints"], strict=True):
             places[f"{side}_{part}"] = mirror * (hip + x, y, z)
     for column in range(SKIRT_COLUMNS):
-        x, z = np.sin(2 * np.pi * column / SKIRT_COLUMNS), np.cos(2 * np.pi * column / SKIRT_COLUMNS)
+        x = np.sin(2 * np.pi * column / SKIRT_COLUMNS)
+        z = np.cos(2 * np.pi * column / SKIRT_COLUMNS)
         places[f"skirt{column}_high"] = (0.07 * x, 0.57, 0.045 * z)
         places[f"skirt{column}_low"] = (0.09 * x, 0.40, 0.07 * z)
     positions = np.array([places[name] for name in JOINTS], dtype=np.float64)
@@ -242,7 +245,8 @@ class Stance:
 
 def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Vector, Rotation]:
     """World place of the ankle and rotation of the foot, which turns about its ball or its heel."""
-    ankle, toe = skeleton.at(f"{side}_foot"), skeleton.at(f"{side}_toe")
+    ankle = skeleton.at(f"{side}_foot")
+    toe = skeleton.at(f"{side}_toe")
     reach = float(toe[2] - ankle[2]) if foot.pitch < 0 else -0.45 * float(toe[2] - ankle[2])
     pivot = np.array([0.0, -ankle[1], reach])
     turn = rotation(1, foot.yaw)
@@ -289,7 +293,8 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
     skeleton.place(names[0], chest @ rotation(2, s * lift), world)
     if arm.target is None:
         R = chest @ rotation(0, -arm.flexion) @ rotation(2, s * arm.abduction) @ rotation(1, -s * arm.twist)
-        upper, fore = R @ hanging, R @ rotation(0, -arm.elbow) @ hanging
+        upper = R @ hanging
+        fore = R @ rotation(0, -arm.elbow) @ hanging
     else:
         shoulder = skeleton.moved(names[1], world[INDEX[names[0]]])
         lengths = (skeleton.length(names[1], names[2]), skeleton.length(names[2], names[3]))
@@ -334,8 +339,10 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
 
 def _tilted(outward: Points, angle_rad: Values) -> Float[np.ndarray, "column 3 3"]:
     """Rotations that lift what hangs down (-y) towards `outward` by these angles."""
-    x, z = outward[:, 0], outward[:, 2]
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x = outward[:, 0]
+    z = outward[:, 2]
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     # In the plane of `outward` and y; what is across both stays.
     rows = [
         [1 + (c - 1) * x * x, -s * x, (c - 1) * x * z],

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_capture import open_capture
 from viewmend.data.videos import VideoFile, VideoWriter
 
 

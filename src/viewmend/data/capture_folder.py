@@ -1,0 +1,314 @@
+"""Capture folders as sources of frames: `open_capture` and `CaptureFolder`."""
+
+import functools
+import logging
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+
+from viewmend.data.camera_images import stack_images
+from viewmend.data.camera_reader import CameraReader
+from viewmend.data.containers import names_in
+from viewmend.data.errors import CaptureError, Issue
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.images import (
+    read_alpha,
+    uses_alpha,
+)
+from viewmend.data.label_masks import LabelMasks
+from viewmend.data.native_format import (
+    CALIBRATION,
+    FILE_KINDS,
+    FileKind,
+    NativeCalibration,
+    NativeCamera,
+    stays_inside,
+)
+from viewmend.data.source import CaptureSource, CaptureWrapper
+from viewmend.data.video_clock import Track, VideoClock, match_tracks, video_track
+from viewmend.data.videos import is_video, video_properties
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.rigid import rigid
+from viewmend.types import MultiViewFrame
+
+
+def open_capture(
+    path: Path | str, cameras: Sequence[str] | None = None, format: str | None = None, *, alpha: bool = False
+) -> "CaptureFolder":
+    """Open a capture folder of any supported format (docs/formats.md).
+
+    Args:
+        path: the folder, or the file that stands for it, such as `cameras.json`.
+        cameras: names of the cameras to use; all by default.
+        format: name of the format; by default it is recognised.
+        alpha: use the alpha channel of the images as masks.
+
+    Raises:
+        CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see `CaptureFolder`).
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from viewmend import open_capture
+        >>> from viewmend.data.native_writer import write_capture
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> folder = Path(tempfile.mkdtemp()) / "take"
+        >>> _ = write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
+        >>> capture = open_capture(folder)
+        >>> len(capture.cameras), len(capture.frame_ids), capture.has_masks
+        (4, 1, True)
+        >>> capture.read(0).rgb.shape
+        torch.Size([4, 3, 64, 64])
+    """
+    capture = CaptureFolder(Path(path), cameras, format, alpha)
+    for issue in capture.issues:
+        logging.getLogger("viewmend").warning("%s: %s", capture.name, issue.text)
+    return capture
+
+
+def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
+    """The coordinates, in a capture's own files, of the origin that its cameras and bounds refer to; metres."""
+    while isinstance(source, CaptureWrapper):
+        source = source.source
+    return source.origin_m if isinstance(source, CaptureFolder) else np.zeros(3)
+
+
+class CaptureFolder:
+    """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
+
+    A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by the times of their
+    frames. Images and masks are undistorted to pinhole images with the same K, and padded right and below to the
+    largest of the frame. The arguments are those of `open_capture`, which logs `issues`. CaptureError if `cameras.json`
+    is invalid; a camera has no files in any frame, or a frame has no camera; only some cameras have masks or depth; a
+    file lies outside the folder; or a camera name is unknown.
+    """
+
+    def __init__(
+        self, path: Path, cameras: Sequence[str] | None = None, format: str | None = None, alpha: bool = False
+    ):
+        path = path.parent if path.name == CALIBRATION and path.is_file() else path
+        calibration = read_any_calibration(path, format)
+        self.folder = folder = calibration.folder
+        self.name = path.stem if path.is_file() else folder.resolve().name
+        """Name of the folder, or of the file that was opened."""
+        self._file = calibration.file
+        self._entries = _select(calibration.cameras, cameras, self._file)
+        if alpha:
+            self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
+        self.cameras = pinhole_cameras(self._entries)
+        self.clock = read_clock(calibration)
+        """When the films' frames were taken; None for a capture of images."""
+        self.frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
+        self._listed = len(calibration.frames)
+        self.fps = calibration.fps
+        self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
+        corners = calibration.bounds_m
+        self.bounds = None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+        self.origin_m = calibration.origin_m
+        """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far from the folder's."""
+        self.metres_per_unit = calibration.metres_per_unit
+        """Length of the folder's own unit. All values of this class are in metres."""
+        self.has_masks = self._all_or_none("mask")
+        self.has_depth = self._all_or_none("depth")
+        self._readers = tuple(CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries)
+        self.present = self._find_files()
+        """Whether each camera has its files in each frame."""
+        self._label_masks = LabelMasks()
+        self._warned_of_labels: set[str] = set()
+
+    @property
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """Camera name and frame id of each missing image."""
+        missing = np.argwhere(~self.present)
+        return tuple((self._entries[camera].name, self.frame_ids[time]) for camera, time in missing)
+
+    @property
+    def issues(self) -> tuple[Issue, ...]:
+        """Films whose times differ from the others'."""
+        if self.clock is None:
+            return ()
+        listed = self._listed
+        found = len(self.frame_ids)
+        text = (
+            f"expected {listed} frames as listed, got videos with {found} common times; the other frames are left out"
+        )
+        return ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
+
+        A camera whose film is damaged at this time is absent. Masks are 0 in a frame without a subject. CaptureError if
+        a file is unreadable or has the wrong size; IndexError if `time` is not in the capture.
+        """
+        if not 0 <= time < len(self.frame_ids):
+            raise IndexError(f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}")
+        views = [int(view) for view in np.flatnonzero(self.present[:, time])]
+        frame_id = self.frame_ids[time]
+        with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
+            images = list(pool.map(lambda view: self._readers[view].read(time), views))
+        self._warn_of_rotation()
+        views = [view for view, image in zip(views, images, strict=True) if image is not None]
+        if not views:
+            raise CaptureError(
+                f"{self.folder}: frame '{frame_id}': expected a readable frame in a video, got none; leave it out"
+            )
+        frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
+        if frame.mask is not None:
+            frame = self._with_opaque_masks(frame)
+        if frame.mask is not None and not frame.has_subject:  # what remains is noise, as of a compressed video
+            frame = replace(frame, mask=torch.zeros_like(frame.mask))
+        return frame
+
+    def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Undistort another image of this camera, such as a clean plate; ValueError for another camera or size."""
+        self.cameras.select([camera])
+        return self._readers[self.cameras.names.index(camera)].undistort(rgb)
+
+    def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """The frame with masks of labels or of low levels as opaque ones; says once how they are read."""
+        assert frame.mask is not None
+        found = self._label_masks.convert(frame.mask)
+        if found is None:
+            return frame
+        named = ", ".join(frame.cameras.names[view] for view in found.views or ())
+        whose = "masks" if found.views is None else f"masks of {named}"
+        if whose not in self._warned_of_labels:
+            self._warned_of_labels.add(whose)
+            text = f"{self.name}: {whose} have no values above {found.highest}: {found.reading}"
+            logging.getLogger("viewmend").warning(text)
+        return replace(frame, mask=found.mask)
+
+    def _warn_of_rotation(self) -> None:
+        rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
+        if rotated:
+            names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
+            logging.getLogger("viewmend").warning(
+                f"{self.name}: EXIF says that images should be {rotated[0].rotation}, but pixels are used as stored "
+                f"(cameras {names}); if calibration and masks are upright, make the images upright too (exiftran -ai)"
+            )
+        for reader in rotated:
+            reader.warned = True
+
+    def _all_or_none(self, kind: FileKind) -> bool:
+        missing = [f"camera '{camera.name}'" for camera in self._entries if getattr(camera, kind) is None]
+        if missing and len(missing) < len(self._entries):
+            expected = f"'{kind}' for every camera or for none"
+            got = f"none for {', '.join(missing)}"
+            raise CaptureError(f"{self._file}: expected {expected}, got {got}; add it, or leave these cameras out")
+        return not missing
+
+    def _find_files(self) -> Bool[np.ndarray, "view time"]:
+        listing = functools.cache(lambda parent: names_in(self.folder / parent))  # each folder is listed once
+
+        def exists(path: str) -> bool:
+            if not stays_inside(path):
+                raise CaptureError(f"{self.folder}: expected a file inside the folder, got {path}; rename the frame")
+            parent, name = os.path.split(path)
+            return name in listing(parent)
+
+        times = range(len(self.frame_ids))
+        present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
+        for camera, row in zip(self._entries, present, strict=True):
+            if not row.any():
+                absent: list[FileKind] = [
+                    k for k in camera.file_kinds if not any(exists(camera.file(k, f)) for f in self.frame_ids)
+                ]
+                wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
+                wanted = f"the camera's {absent[0]} in at least one frame" if absent else wanted
+                path = camera.file((*absent, *camera.file_kinds)[0], self.frame_ids[0])
+                frame = self.frame_ids[0]
+                where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
+                got = f"found none in {len(self.frame_ids)} frames"
+                next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
+                raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
+        for time in np.flatnonzero(~present.any(0)).tolist():
+            raise CaptureError(self._without_cameras(time, exists))
+        return present
+
+    def _without_cameras(self, time: int, exists: Callable[[str], bool]) -> str:
+        """What is wrong with a frame in which no camera has all of its files, and what to do about it."""
+        kinds: list[FileKind] = [k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)]
+        own = {kind: [reader for reader in self._readers if kind in reader.camera.file_kinds] for kind in kinds}
+        absent: list[FileKind] = [k for k in kinds if all(reader.lacks(k, time, exists) for reader in own[k])]
+        first: FileKind = (absent or kinds)[0]
+        _, where = own[first][0].locate(first, time)
+        wanted = "this file or another camera's" if absent else f"{' and '.join(kinds)} of the same camera"
+        got = f"no {' and no '.join(absent)} of any camera" if absent else "no camera that has all"
+        steps = ["add them, black ones if there is no subject" if absent == ["mask"] else "add them"]
+        if self._file.name == CALIBRATION and self.clock is None:
+            steps.append(f"remove the frame from {self._file}")
+        elif self._file.name != CALIBRATION and "image" in kinds and "image" not in absent:
+            steps.append("remove the frame's images")
+        return f"{where}: expected {wanted}, got {got}; {', or '.join(steps)}"
+
+
+def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[NativeCamera, ...]:
+    if names is None:
+        return cameras
+    by_name = {camera.name: camera for camera in cameras}
+    unknown = [name for name in names if name not in by_name]
+    if unknown or not names or len(set(names)) < len(names):
+        raise CaptureError(
+            f"{file}: expected cameras among {list(by_name)}, each once, got {list(names)}; choose again"
+        )
+    return tuple(by_name[name] for name in names)
+
+
+def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:
+    """The camera with its images as masks; raises a CaptureError if none of its images has alpha."""
+    if camera.image is None:
+        where = f"{folder}: camera '{camera.name}'"
+        raise CaptureError(f"{where}: expected images with alpha, got a video; use another --method")
+    files = [folder / camera.file("image", frame) for frame in frames]
+    if not any(uses_alpha(file) for file in files) and (file := next(filter(Path.is_file, files), None)):
+        read_alpha(file, f"{file}: camera '{camera.name}'")
+    return replace(camera, mask=camera.image)
+
+
+def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
+    """The cameras after undistortion, in metres."""
+    R = torch.tensor(np.stack([camera.R for camera in cameras]))
+    t = torch.tensor(np.stack([camera.t_m for camera in cameras]))
+    return Cameras(
+        names=tuple(camera.name for camera in cameras),
+        K=torch.tensor(np.stack([camera.K for camera in cameras])).float(),
+        camera_from_world=rigid(R, t).float(),
+        size_px=torch.tensor([[camera.width, camera.height] for camera in cameras]),
+    )
+
+
+def read_clock(calibration: NativeCalibration) -> VideoClock | None:
+    """Match the films of a capture by time; None if it has no films and no offsets.
+
+    Numbered images count as films with the capture's frame rate, or else that of its first film. CaptureError if a film
+    cannot be decoded, no two show the same time, or offsets lack a frame rate.
+    """
+    cameras = calibration.cameras
+    folder = calibration.folder
+    files = {(c.name, kind): path for c in cameras for kind, path in (("images", c.video), ("masks", c.mask)) if path}
+    films = {key: folder / path for key, path in files.items() if is_video(path) and (folder / path).is_file()}
+    if not films and not any(camera.offset_ms for camera in cameras):
+        return None
+    fps = calibration.fps or next((video_properties(path).fps for path in films.values()), None)
+    if fps is None:
+        raise CaptureError(f"{calibration.file}: expected fps, which offset_ms needs, got none; add it")
+    numbers_s = np.arange(len(calibration.frames)) / fps
+    tracks = []
+    for camera in cameras:
+        offset_s = camera.offset_ms / 1000
+        for kind in ("images", "masks"):
+            if (path := films.get((camera.name, kind))) is not None:
+                tracks.append(video_track(camera.name, kind, path, offset_s))
+            elif kind == "images":  # numbered masks follow their images
+                tracks.append(Track(camera.name, kind, numbers_s, fps, offset_s))
+    try:
+        return match_tracks(tracks)
+    except ValueError as error:
+        raise CaptureError(f"{calibration.file}: {error}") from None
