@@ -28,10 +28,6 @@ class LabelMaskRule:
     """A pixel of masks with many values is at their level if it differs from it by at most this share of the level."""
 
 
-RULE = LabelMaskRule()
-"""The thresholds that are used."""
-
-
 @dataclass(frozen=True)
 class ConvertedMasks:
     """Masks that were made opaque, and how."""
@@ -49,6 +45,7 @@ class LabelMasks:
     """Converts the masks of the frames of a capture. It remembers whether any mask so far was opaque."""
 
     def __init__(self) -> None:
+        self._rule = LabelMaskRule()
         self._seen_opaque = False
 
     def convert(self, mask: Masks) -> ConvertedMasks | None:
@@ -59,33 +56,33 @@ class LabelMasks:
         holds a label if it consists of 0 and one low value.
         """
         highest = mask.flatten(1).amax(1).tolist()
-        self._seen_opaque = self._seen_opaque or max(highest) >= RULE.opaque
+        self._seen_opaque = self._seen_opaque or max(highest) >= self._rule.opaque
         if self._seen_opaque:
-            views = _views_with_one_label(mask, highest)
+            views = _views_with_one_label(mask, highest, self._rule)
             return _from_labels(mask, views, tuple(views), max(highest[view] for view in views)) if views else None
         if not any(highest):
             return None
         count = len(torch.bincount(mask.flatten(), minlength=256).nonzero())
-        if count <= RULE.max_labels:
+        if count <= self._rule.max_labels:
             return _from_labels(mask, range(len(mask)), None, max(highest))
-        return _from_low_level(mask, max(highest))
+        return _from_low_level(mask, max(highest), self._rule)
 
 
-def _views_with_one_label(mask: Masks, highest: Sequence[int]) -> list[int]:
+def _views_with_one_label(mask: Masks, highest: Sequence[int], rule: LabelMaskRule) -> list[int]:
     """The views whose masks consist of 0 and one low value.
 
     Such a mask may also be nearly transparent; it counts as a label if neither 0 nor the value is rare.
     """
     size = mask[0].numel()
-    least = RULE.min_share * size
+    least = rule.min_share * size
     found = []
     for view, top in enumerate(highest):
-        if top >= RULE.opaque:
+        if top >= rule.opaque:
             continue
         inside = int(mask[view].count_nonzero())
         labelled = int((mask[view] == top).sum())
         is_common = least < inside < size - least
-        if is_common and labelled >= max(least, RULE.min_one_level * inside):
+        if is_common and labelled >= max(least, rule.min_one_level * inside):
             found.append(view)
     return found
 
@@ -97,12 +94,12 @@ def _from_labels(mask: Masks, views: Sequence[int], named: tuple[int, ...] | Non
     return ConvertedMasks(converted, named, highest, "they are read as labels, with 0 as background")
 
 
-def _from_low_level(mask: Masks, highest: int) -> ConvertedMasks | None:
+def _from_low_level(mask: Masks, highest: int, rule: LabelMaskRule) -> ConvertedMasks | None:
     """The masks scaled so that the level of their foreground is opaque; None if it has no common level."""
     values = mask[mask > highest // 4].float()
     level = float(values.median()) if len(values) else 0.0
-    at_level = (values - level).abs() <= RULE.max_spread * level
-    if float(at_level.float().mean()) < RULE.min_one_level:
+    at_level = (values - level).abs() <= rule.max_spread * level
+    if float(at_level.float().mean()) < rule.min_one_level:
         return None
     scaled = (mask * (255 / level)).round().clamp(max=255).to(torch.uint8)
     return ConvertedMasks(scaled, None, highest, f"they are scaled, with {level:.0f} as opaque")

@@ -22,6 +22,23 @@ BLANK_PX = 128
 """Blank images are looked for in every n-th pixel, so that at least this many remain along the longer side."""
 HULL = HullConfig(resolution=64)
 """Hulls have this resolution."""
+SUSPECT = 1.25
+"""Changed images are tried for a camera whose distance is more than this many times the median: mirrored, rotated, BGR,
+and those of other cameras."""
+FITS = 0.65
+"""A changed image explains the fault if its distance is below this share of the original's."""
+PALE = 0.4
+"""An image is grey if its saturation is below this share of the median."""
+COLOURFUL = 0.05
+"""Grey images are looked for if the median saturation is above this."""
+FLAT = 0.05
+"""An image shows nothing if its pixel differences are below this share of the median."""
+DARK = 1.0
+"""An image shows nothing if its mean is below this value of 255, unless the median is, too."""
+BLURRED = 0.45
+"""An image is blurred if its pixel differences are below this many times the median."""
+NOISY = 2.0
+"""An image is noisy if its pixel differences are above this many times the median."""
 
 
 @dataclass(frozen=True)
@@ -44,27 +61,6 @@ class OtherSubjectRule:
     """The rig has at least this many cameras: medians of fewer say little."""
 
 
-OTHER_SUBJECT = OtherSubjectRule()
-"""The rule that is used."""
-SUSPECT = 1.25
-"""Changed images are tried for a camera whose distance is more than this many times the median: mirrored, rotated, BGR,
-and those of other cameras."""
-FITS = 0.65
-"""A changed image explains the fault if its distance is below this share of the original's."""
-PALE = 0.4
-"""An image is grey if its saturation is below this share of the median."""
-COLOURFUL = 0.05
-"""Grey images are looked for if the median saturation is above this."""
-FLAT = 0.05
-"""An image shows nothing if its pixel differences are below this share of the median."""
-DARK = 1.0
-"""An image shows nothing if its mean is below this value of 255, unless the median is, too."""
-BLURRED = 0.45
-"""An image is blurred if its pixel differences are below this many times the median."""
-NOISY = 2.0
-"""An image is noisy if its pixel differences are above this many times the median."""
-
-
 def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
     """Find cameras whose images do not match the others'; empty if they cannot be compared."""
     small = limit_size(frame, LONGEST_PX)
@@ -82,7 +78,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
     better = _find_better_fits(small, surface, colours, distance, suspects)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
-    rule = OTHER_SUBJECT
+    rule = OtherSubjectRule()
     farther = (distance > rule.lower_ratio * typical) & (correlation < rule.max_correlation * alike)
     enough = len(distance) >= rule.min_cameras
     far = ((distance > rule.ratio * typical) | (farther & enough)) & (distance > rule.min_distance)

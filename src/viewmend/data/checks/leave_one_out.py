@@ -55,6 +55,8 @@ MAX_LEFT = 0.5
 AMBIGUOUS = 0.7
 """The second suspect is named too if the ratio of the best residual to its own is higher than this."""
 
+Silhouettes = Bool[Tensor, "view height width"]
+
 
 @dataclass(frozen=True)
 class OutlierThresholds:
@@ -88,14 +90,6 @@ class RoughRigThresholds:
     """A suspect may be the outlier if at most this share of the residual remains without it."""
     min_left_of_others: float = 1.25
     """Leaving out any other suspect must leave at least this many times the residual that remains without it."""
-
-
-OUTLIER = OutlierThresholds()
-"""The shares that are used."""
-ROUGH_RIG = RoughRigThresholds()
-"""The rule that is used."""
-
-Silhouettes = Bool[Tensor, "view height width"]
 
 
 @dataclass(frozen=True)
@@ -161,22 +155,23 @@ def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull
     found = leave_one_out(small, bounds, hull)
     if found is None:
         return ()
+    thresholds = OutlierThresholds()
     names = small.cameras.names
     few = len(small.cameras) <= FEW_CAMERAS
     view = int(found.outside.argmax())
     share = float(found.outside[view])
-    if share > OUTLIER.outside + 3 * float(found.outside.median()):
+    if share > thresholds.outside + 3 * float(found.outside.median()):
         if _is_explained_by_borders(small, bounds, view):
             return (Issue(_cut_off_text(small)),)
         text = f"camera '{names[view]}': {100 * share:.0f} % of its mask is outside the hull of all others"
-        return (_outlier(text, names[view], share > OUTLIER.left_out_outside),)
+        return (_outlier(text, names[view], share > thresholds.left_out_outside),)
     view = int(found.removed.argmax())
     share = float(found.removed[view])
     typical = max(0.0, float((found.removed.sum() - found.removed[view]) / (len(names) - 1)))
     coarser = min(2.0, FINE_PX / min(FINE_PX, int(frame.cameras.size_px.amax())))
-    if share > OUTLIER.removed * coarser + 1.5 * typical:
+    if share > thresholds.removed * coarser + 1.5 * typical:
         text = f"camera '{names[view]}' alone removes {100 * share:.1f} % of the subject that the others see"
-        bound = OUTLIER.left_out_removed_of_few if few else OUTLIER.left_out_removed
+        bound = thresholds.left_out_removed_of_few if few else thresholds.left_out_removed
         return (_outlier(text, names[view], share > bound),)
     return ()
 
@@ -195,7 +190,7 @@ def _is_explained_by_borders(frame: MultiViewFrame, bounds: Bounds | None, view:
     except ValueError:
         return False
     covered = pad_like(proxy.depth(own.cameras) > 0, own.mask)
-    return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= OUTLIER.outside
+    return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= OutlierThresholds().outside
 
 
 def _cut_off_text(frame: MultiViewFrame) -> str:
@@ -242,10 +237,11 @@ def find_outlier_by_outlines(frame: MultiViewFrame, bounds: Bounds | None) -> tu
     order = np.argsort(left)
     best = left[order[0]]
     second = left[order[1]] if len(order) > 1 else residual
+    rule = RoughRigThresholds()
     rough = (
-        residual >= ROUGH_RIG.min_residual_px
-        and best <= ROUGH_RIG.max_left * residual
-        and second >= ROUGH_RIG.min_left_of_others * best
+        residual >= rule.min_residual_px
+        and best <= rule.max_left * residual
+        and second >= rule.min_left_of_others * best
     )
     if best > MAX_LEFT * residual and not rough:
         return None
