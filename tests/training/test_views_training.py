@@ -308,7 +308,7 @@ def test_a_run_resumes_and_is_validated(tiny_views, tmp_path):
     train(replace(config, steps=2), tmp_path / "twice")
     twice = train(config, tmp_path / "twice")
     logs = [log_of(run) for run in (once, twice)]
-    scores = next(line["validation"] for line in logs[0] if "validation" in line)
+    scores = next(line["validation"] for line in logs[0] if line.get("validation"))
     assert scores["rendered"] > 10 and scores["completed"] > 5 and (once / "validation-000004.png").exists()
     losses = [[line["losses"]["total"] for line in run if "losses" in line] for run in logs]
     assert len(losses[0]) == len(losses[1]) == 4 and losses[0][:2] == losses[1][:2]
