@@ -204,7 +204,7 @@ def score_view(
     assert whole is not None and whole_rendered is not None, "images have pixels"
     maps = {"lpips_alex": scorers.lpips_alex, "lpips_vgg": scorers.lpips_vgg}
     maps["ssim"] = None if scorers.ssim is None else partial(ssim_map, window=scorers.ssim)
-    by_map: dict[str, float | None] = {}
+    by_map: dict[str, Any] = {}
     for name, score in maps.items():
         by_map |= {} if score is None else _readings(name, score, rgb, truth, holes)
     return ViewScores(

@@ -161,7 +161,7 @@ def _acquire_lock(folder: Path) -> BaseFileLock:
     except Timeout:
         raise ValueError(f"{in_use}, or choose another folder") from None
     except OSError as error:  # network file systems often have no locks
-        reason = error.strerror
+        reason = error.strerror or str(error)
     with contextlib.suppress(OSError):
         (folder / HIDDEN / LOCK).unlink()
     marker = SoftFileLock(folder / HIDDEN / MARKER)
