@@ -206,7 +206,8 @@ def score_view(
     maps["ssim"] = None if scorers.ssim is None else partial(ssim_map, window=scorers.ssim)
     by_map: dict[str, Any] = {}
     for name, score in maps.items():
-        by_map |= {} if score is None else _readings(name, score, rgb, truth, holes)
+        if score is not None:
+            by_map.update(_readings(name, score, rgb, truth, holes))
     return ViewScores(
         time=view.time,
         width_px=width,
