@@ -260,7 +260,7 @@ def _readings(
     rgb: Float[Tensor, "3 height width"],
     truth: TrueView,
     holes: Bool[Tensor, "height width"],
-) -> dict[str, float | None]:
+) -> dict[str, Any]:
     """The readings of a score that has a map; NaN values of the map do not count."""
     scored = score(rgb, truth.rgb)
     if scored is None:
@@ -275,7 +275,7 @@ def _readings(
 
 def _temporal(
     now: Float[Tensor, "3 height width"], view: IncompleteView, truth: TrueView, previous: PreviousView
-) -> dict[str, float | None]:
+) -> dict[str, Any]:
     then = previous.rgb
     true_now = truth.rgb
     true_then = previous.truth
