@@ -32,9 +32,9 @@ def test_modes_show_their_pictures(view):
         choose(view, name)
         assert view.server.looks[-1]["modes"] == [mode]
         seen[name] = view.picture()
-    assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Output"], scene.PINK)
+    assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Completed"], scene.PINK)
     black = {name: (pixels.max(-1) < 20).mean() for name, pixels in seen.items()}
-    assert black["Rendered"] > black["Output"] + 0.004
+    assert black["Rendered"] > black["Completed"] + 0.004
     depth = seen["Depth"][seen["Depth"].max(-1) > 60]
     assert np.abs(depth[:, 0] - depth[:, 2]).max() < 30
     for colour in scene.COLOURS:

@@ -61,11 +61,11 @@ def test_pictures_answer_to_pose_mode_and_time(view):
     turned = view.picture()
     assert np.abs(first - turned).mean() > 0.3
     shown = {}
-    for name in ("Rendered", "Holes", "Depth", "Source cameras", "Output"):
+    for name in ("Rendered", "Holes", "Depth", "Source cameras", "Completed"):
         view.page.locator("#modes").get_by_role("radio", name=name).click()
         rest(view)
         shown[name] = view.picture()
-    np.testing.assert_allclose(np.abs(shown["Output"] - turned).mean(), 0, atol=0.1)
+    np.testing.assert_allclose(np.abs(shown["Completed"] - turned).mean(), 0, atol=0.1)
     for name in ("Rendered", "Holes", "Depth", "Source cameras"):
         assert np.abs(shown[name] - turned).mean() > 0.005, name
     now = int(view.data("time"))
