@@ -23,7 +23,7 @@ from av.filter import Graph
 from measure import write
 from reference.films import MATRICES, picture, set_matrix, write_film
 
-from viewmend.contrib.live_rig.frame_readers import Playback, pictures_of
+from viewmend.contrib.live_rig.frame_readers import Playback, read_pictures
 from viewmend.data.videos import VideoFile, to_rgb, video_properties
 
 COUNT = 24
@@ -112,7 +112,7 @@ def live(path: Path, count: int) -> np.ndarray:
     """All frames, (time, height, width, 3), as a live rig plays them; a lap takes no time."""
     playback = AtOnce(1e9)
     camera: Any = SimpleNamespace(name="a", url=str(path), is_file=True, offset_s=0.0)
-    with closing(pictures_of(camera, Counter(), playback, lambda seconds: False)) as pictures:
+    with closing(read_pictures(camera, Counter(), playback, lambda seconds: False)) as pictures:
         return np.stack([to_rgb(played.frame) for played in islice(pictures, count)])
 
 

@@ -131,7 +131,7 @@ def test_cells_at_pixels_equal_an_upsampled_image(shape, rng):
     index = index_image(cells, size)
     inside = (index >= 0).repeat_interleave(CELL_PX, 0).repeat_interleave(CELL_PX, 1)[: shape[0], : shape[1]]
     pixels = torch.nonzero(inside)
-    distribution = DepthDistribution(cells, index, torch.zeros(rows, columns), values, None, None)
+    distribution = DepthDistribution(cells, index, torch.zeros(rows, columns), values, None, None, None)
     image = scatter_to_image(torch.cat([values, torch.ones(len(cells), 1)], 1), cells, size)
     image = F.interpolate(image[None], scale_factor=CELL_PX, mode="bilinear")[0]
     at = image[:, pixels[:, 0], pixels[:, 1]].T

@@ -251,7 +251,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_saves_its_batch(tiny, tmp_pa
 def test_validation_scores_the_averaged_weights_and_writes_an_image(tiny, tmp_path):
     train(replace(tiny, validate_every=3), tmp_path)
     logged = [entry for entry in log_of(tmp_path) if "validation" in entry]
-    assert [entry["step"] for entry in logged] == [3, 4]
+    assert [entry["step"] for entry in logged] == [0, 3, 4]
     with join_processes() as own:
         validation = Run(tiny, tmp_path / "other", None, own).objective.validation
     model, found, telea = load_network(tmp_path).eval(), [], Telea()
@@ -266,4 +266,4 @@ def test_validation_scores_the_averaged_weights_and_writes_an_image(tiny, tmp_pa
     expected = torch.tensor(found).mean(0).tolist()
     assert [logged[-1]["validation"][name] for name in ("holes", "telea")] == pytest.approx(expected, abs=2e-3)
     assert logged[0]["validation"]["telea"] == logged[1]["validation"]["telea"], "the views are fixed"
-    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["validation-000003.png", "validation-000004.png"]
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == [f"validation-{step:06d}.png" for step in (0, 3, 4)]

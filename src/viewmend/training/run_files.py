@@ -184,7 +184,9 @@ class Log:
 
     def add(self, progress: Progress) -> None:
         """Log a step."""
-        self._write(asdict(progress))
+        values = asdict(progress)
+        del values["validation"]  # it has a line of its own
+        self._write(values)
         rates = {name: getattr(progress, name) for name in ("learning_rate", "samples_per_s", "waiting")}
         self._plot(progress.step, "loss", progress.losses)
         self._plot(progress.step, "rate", rates)
@@ -199,7 +201,7 @@ class Log:
         if self._file is None:
             return {}
         entries = map(json.loads, self._path.read_text(encoding="utf-8").splitlines())
-        return next((entry["validation"] for entry in entries if "validation" in entry and "losses" not in entry), {})
+        return next((entry["validation"] for entry in entries if "validation" in entry), {})
 
     def _write(self, values: Mapping[str, object]) -> None:
         if self._file is not None:
