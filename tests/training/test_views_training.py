@@ -11,8 +11,11 @@ from reference.other_device import DEVICE, other_device
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
 
 from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.rim import rim_depth
+from viewmend.models.base import DepthMap
 from viewmend.models.checkpoint import load_network, save_inpainter
+from viewmend.models.classical import Unfilled
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.grid import nearest_depth
 from viewmend.models.views.model import ViewSynthNet
@@ -112,6 +115,44 @@ def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
         assert torch.equal(near.rgb.movedim(1, -1)[inside], own.rgb.movedim(1, -1)[inside])
         both = (near.depth > 0) & (own.depth > 0)
         assert float((near.depth - own.depth)[both].abs().median()) < 0.01, "of every second pixel"
+
+
+class TrueDepth(Unfilled):
+    """Predicts the depth of the true surface, with full confidence."""
+
+    predicts_depth = True
+
+    def __init__(self, studio):
+        self.mesh = studio.scene(0).mesh
+
+    def predict_depth(self, view, context):
+        depth = rasterize(self.mesh, view.camera).depth[0] * (view.depth > 0)
+        return DepthMap(depth, (depth > 0).float())
+
+
+def test_cameras_that_are_held_out_together_share_fused_geometry(studio):
+    config = replace(VIEWS_SCENES, num_holdout_views=6, fused_fraction=1.0)
+    rig = scene_of(studio).rig
+    scene = sample_from_bytes(sample_to_bytes(store_scene(Scene(rig, Random(0)), config, TrueDepth(studio))))
+    assert len(scene.held) == 1, "a quarter of six cameras"
+    held = scene.held[0]
+    assert held.left_out == (held.name,)
+    hull = store_scene(Scene(rig, Random(0)), config)
+    assert len(hull.held) == 6 and held.name == hull.held[0].name and not hull.held[0].left_out
+
+    def error_m(stored):
+        sample = stored.sample(0, VIEWS_RENDER, 4)
+        both = (sample.view.depth > 0) & (sample.depth > 0)
+        return float((sample.view.depth - sample.depth)[both].abs().mean())
+
+    assert error_m(scene) < 0.7 * error_m(hull)
+
+
+def test_cameras_that_are_held_out_together_do_not_colour_each_other(stored):
+    names = tuple(view.name for view in stored.held[:2])
+    together = replace(stored, held=(replace(stored.held[0], left_out=names), *stored.held[1:]))
+    assert not set(together.sample(0, VIEWS_RENDER, 4).view.candidate_views) & set(names)
+    assert names[1] in stored.sample(0, VIEWS_RENDER, 4).view.candidate_views
 
 
 def test_views_behind_depth_maps_have_the_true_surface_and_its_errors(stored, view):

@@ -36,6 +36,8 @@ class SceneConfig:
     """Smallest and largest number of cameras in a studio rig."""
     rigs: Annotated[tuple[Literal["ring", "dome", "layers"], ...], HIDDEN] = ("ring", "dome")
     """How the cameras of studio rigs are placed; of several ways, one is drawn for each rig."""
+    fused_fraction: float = 0.0
+    """Fraction of the scenes of `views` behind geometry that is fused from predicted depth, instead of hulls."""
     shared_hull: Annotated[bool, HIDDEN] = False
     """Whether a quarter of each studio rig's cameras are held out together, and share the hull of the others."""
     num_holdout_views: int = 4

@@ -17,6 +17,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.models.base import Inpainter
 from viewmend.models.classical import Unfilled
 from viewmend.rendering.view import RenderConfig, render_depth
 from viewmend.stream import Stream, StreamConfig
@@ -27,6 +28,8 @@ from viewmend.training.scenes import RigSource, Scene
 from viewmend.training.shards import storable
 from viewmend.types import MultiViewFrame
 
+HELD_FRACTION = 1 / 4
+"""This fraction of a rig's cameras, at most, is held out together and shares its fused geometry."""
 STEPS = 65535
 """Vertices and depths are quantised to this number of steps over their range."""
 ADVICE = "write the shard again"
@@ -66,10 +69,12 @@ class StoredView:
     depth: StoredDepth | None
     """True depth of its view; None if unavailable."""
     vertices: UInt16[Tensor, "vertex 3"]
-    """Vertices of the hull of the other cameras, in steps of `bounds`."""
+    """Vertices of the other cameras' hull or fused geometry, in steps of `bounds`."""
     faces: Int32[Tensor, "index"]
     """Differences of consecutive vertex indices of the faces, which compress better than the indices."""
     bounds: Bounds
+    left_out: tuple[str, ...] = ()
+    """Cameras that were held out together with this one, this one included; none: this one alone."""
 
 
 @storable
@@ -98,7 +103,7 @@ class StoredScene:
         _check(view.truth, view.truth.cameras)
         depth = None if self.depth is None else _upsampled(self.depth.metres(), self.frame)
         frame = replace(self.frame, cameras=view.cameras, depth=depth)
-        others = replace(frame, depth=None).without([view.name])
+        others = replace(frame, depth=None).without(view.left_out or (view.name,))
         target = view.cameras.select([view.name])
         true_depth = None if view.depth is None else view.depth.metres()[0]
         if errors is None or depth is None or true_depth is None:
@@ -128,8 +133,13 @@ def _check(frame: MultiViewFrame, cameras: Cameras) -> None:
         raise ValueError(f"expected stored images and masks of the cameras' sizes {size}, got {shapes}; {ADVICE}")
 
 
-def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
-    """The first frame of a rig, with `num_holdout_views` of its cameras held out in turn."""
+def store_scene(scene: Scene, config: SceneConfig, depth_model: Inpainter | None = None) -> StoredScene:
+    """The first frame of a rig, with some of its cameras held out.
+
+    With a model that predicts depth, the geometry of `fused_fraction` of the scenes is fused, which takes seconds:
+    their cameras are held out together, `HELD_FRACTION` of the rig, and share it. In other scenes they are held out in
+    turn, each behind the hull of all the others.
+    """
     rig = scene.rig
     time = min(scene.rig.frames)
     frame = rig.frames[time]
@@ -137,14 +147,37 @@ def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
     held = scene.random.sample(names, min(config.num_holdout_views, len(names)))
     depth = StoredDepth.of(None if frame.depth is None else frame.depth[:, ::2, ::2])
     hull = HullConfig(resolution=config.hull_resolution)
-    return StoredScene(_on_black(frame), depth, tuple(_store_view(scene, name, time, hull) for name in held))
+    if depth_model is not None and scene.random.random() < config.fused_fraction:
+        together = tuple(held[: max(1, int(HELD_FRACTION * len(names)))])
+        proxy = _fused_geometry(scene, together, time, hull, depth_model)
+        views = tuple(_store_view(scene, name, time, proxy, together) for name in together)
+    else:
+        views = tuple(_store_view(scene, name, time, _hull(scene, name, time, hull)) for name in held)
+    return StoredScene(_on_black(frame), depth, views)
 
 
-def _store_view(scene: Scene, name: str, time: int, hull: HullConfig) -> StoredView:
+def _hull(scene: Scene, name: str, time: int, hull: HullConfig) -> GeometryProxy:
+    """The hull of all cameras but one."""
     proxy = HeldOutCamera(scene.rig, name, hull).frame(time).proxy
-    truth = scene.rig.truth(name, time)
     assert isinstance(proxy, GeometryProxy), "the proxy of a held-out camera is a hull"
+    return proxy
+
+
+def _fused_geometry(
+    scene: Scene, held: tuple[str, ...], time: int, hull: HullConfig, depth_model: Inpainter
+) -> GeometryProxy:
+    """The hull of all cameras but some, tightened by the depth that the model predicts."""
+    config = StreamConfig(geometry="fused", hull=hull, memory_mb=None)
+    stream = Stream(Unfilled(), config, scene.rig.bounds, error_model=depth_model)
+    others = scene.rig.inputs(held[0], time).without(held[1:])
+    proxy = stream.add_frame(others).proxy
+    assert isinstance(proxy, GeometryProxy), "the stream computes it"
+    return proxy
+
+
+def _store_view(scene: Scene, name: str, time: int, proxy: GeometryProxy, left_out: tuple[str, ...] = ()) -> StoredView:
     mesh = proxy.mesh
+    truth = scene.rig.truth(name, time)
     bounds = proxy.bounds
     vertices = (STEPS * (mesh.vertices - bounds.low) / bounds.size_m).round().clamp(0, STEPS).to(torch.uint16)
     indices = mesh.faces.flatten().int()
@@ -156,6 +189,7 @@ def _store_view(scene: Scene, name: str, time: int, hull: HullConfig) -> StoredV
         vertices,
         torch.diff(indices, prepend=indices.new_zeros(1)),
         bounds,
+        left_out,
     )
 
 
@@ -187,10 +221,12 @@ class StoredSceneMaker:
 
     rigs: RigSource
     config: SceneConfig
+    depth_model: Inpainter | None = None
+    """Predicts the depth from which geometry is fused; without it, all views are behind hulls."""
 
     def scene(self, number: int) -> list[StoredScene]:
         """Scene `number`."""
-        return [store_scene(self.rigs.rig(number), self.config)]
+        return [store_scene(self.rigs.rig(number), self.config, self.depth_model)]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.sampling import in_view
 from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, load_lpips
-from viewmend.models.checkpoint import load_network
+from viewmend.models.checkpoint import load_inpainter, load_network
 from viewmend.models.network import set_compute_dtype
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import CELL_PX, nearest_depth, scatter_to_image
@@ -372,6 +372,8 @@ class ViewsObjectiveConfig(ObjectiveConfig):
     """'all': everything but the ray fill. 'errors': only the error predictor of the --from model."""
     coarse_from: str = "rays"
     """Name or folder of the model whose ray fill completes holes; its weights are copied and stay fixed."""
+    fused_from: str = "views"
+    """Name or folder of the model whose predicted depth is fused, if `fused_fraction` is above 0."""
     loss: ViewsLossWeights = field(default_factory=ViewsLossWeights)
     objective = ViewsObjective
     item = StoredScene
@@ -383,7 +385,8 @@ class ViewsObjectiveConfig(ObjectiveConfig):
         if scenes.protocols != ("strict",):
             found = " ".join(scenes.protocols)
             raise ValueError(f"expected --protocols strict for views, got {found}; leave --protocols out")
-        return StoredSceneMaker(rig_source(scenes, self.sampling.frames, seed), scenes)
+        depth_model = load_inpainter(self.fused_from) if scenes.fused_fraction > 0 else None
+        return StoredSceneMaker(rig_source(scenes, self.sampling.frames, seed), scenes, depth_model)
 
 
 def _gradient_loss(made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size) -> Float[Tensor, ""]:
