@@ -99,7 +99,9 @@ def full_house(url: str, seconds: float, viewers: int = 8) -> dict[str, float]:
             while time.monotonic() < end:
                 camera, asked = {"azimuth": 45.0 * seat + len(waits)}, time.monotonic()
                 viewer.frame(
-                    viewer.look(camera=camera, width=SIDE_PX, height=SIDE_PX, moving=True, adaptive=seat % 2 == 0)
+                    viewer.look(
+                        camera=camera, width=SIDE_PX, height=SIDE_PX, moving=True, adaptive=seat % 2 == 0
+                    )
                 )
                 waits.append(time.monotonic() - asked)
 
@@ -147,7 +149,14 @@ def main() -> None:
     report |= {"exit_code": code, "lines_said": len(said)}
     report["seconds_to_end"] = round(time.monotonic() - began, 1)
     if given.write:
-        print(write("attack", "cpu", {"connections": 5 * EACH, "seconds": given.seconds, "model": given.model}, report))
+        print(
+            write(
+                "attack",
+                "cpu",
+                {"connections": 5 * EACH, "seconds": given.seconds, "model": given.model},
+                report,
+            )
+        )
     print(json.dumps({key: report[key] for key in report if key != "waves"}))
 
 

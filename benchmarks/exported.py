@@ -56,7 +56,8 @@ def runner_of(file: Path) -> Runner:
     session = onnxruntime.InferenceSession(file, threads)
     names = [own.name for own in session.get_inputs()]
     return lambda given: [
-        torch.from_numpy(image) for image in session.run(None, {name: getattr(given, name).numpy() for name in names})
+        torch.from_numpy(image)
+        for image in session.run(None, {name: getattr(given, name).numpy() for name in names})
     ]
 
 
@@ -77,11 +78,15 @@ def compared(net: ViewSynthNet, runners: dict[str, Runner], scenes: int) -> dict
             }
             for output, image in off.items():
                 furthest[name].setdefault(output, []).append(float(image.max()))
-            wrong = torch.stack([image.reshape(-1, *view.mask.shape).amax(0) > TOLERANCE for image in off.values()])
+            wrong = torch.stack(
+                [image.reshape(-1, *view.mask.shape).amax(0) > TOLERANCE for image in off.values()]
+            )
             over[name] += int(wrong.any(0).sum())
             views[name] += bool(wrong.any())
         print(
-            f"{seed}: {tuple(view.mask.shape)}", {n: max(f["completed_rgb"]) for n, f in furthest.items()}, flush=True
+            f"{seed}: {tuple(view.mask.shape)}",
+            {n: max(f["completed_rgb"]) for n, f in furthest.items()},
+            flush=True,
         )
     return {
         name: {f"largest_{output}": max(values) for output, values in furthest[name].items()}

@@ -71,7 +71,9 @@ def hull_figures(views: int, config: HullConfig, device: str, runs: int) -> dict
         "voxels": list(visual_hull(masks, cameras, box, config).values.shape),
         "search": timed(lambda: occupied_bounds(masks, cameras, stage, config), runs, device=device),
         "hull_in_its_box": timed(lambda: visual_hull(masks, cameras, box, config), runs, device=device),
-        "hull_of_the_whole_cube": timed(lambda: visual_hull(masks, cameras, stage, config), runs, device=device),
+        "hull_of_the_whole_cube": timed(
+            lambda: visual_hull(masks, cameras, stage, config), runs, device=device
+        ),
         "reconstruct": timed(lambda: reconstruct(masks, cameras, stage, config), runs, device=device),
     }
 
@@ -91,7 +93,9 @@ def frame_figures(config: HullConfig, device: str, runs: int) -> dict[str, objec
         "surface": timed(lambda: extract_surface(grid), runs, device=device),
         "normals": timed(lambda: vertex_normals(proxy.mesh), runs, device=device),
         "depth_of_9_views": timed(lambda: proxy.depth(nine), runs, device=device),
-        "whole_frame": timed(lambda: reconstruct(masks, cameras, stage, config).depth(nine), runs, device=device),
+        "whole_frame": timed(
+            lambda: reconstruct(masks, cameras, stage, config).depth(nine), runs, device=device
+        ),
     }
 
 

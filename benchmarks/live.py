@@ -61,7 +61,9 @@ def walk(url: str, size: tuple[int, int], seconds: float, start: float, out: lis
                 "fps": round(len(frames) / taken, 2),
                 "kb_per_frame": round(sum(frame.size for frame in frames) / 1000 / len(frames), 1),
                 "width_mean": round(sum(frame.header["width"] for frame in frames) / len(frames)),
-                "stage_ms": {s: summarise([f.header["stage_ms"][s] for f in frames])["median_ms"] for s in stages},
+                "stage_ms": {
+                    s: summarise([f.header["stage_ms"][s] for f in frames])["median_ms"] for s in stages
+                },
                 "shared": round(sum(f.header["stage_ms"]["geometry"] == 0 for f in frames) / len(frames), 3),
             }
         )
@@ -71,7 +73,8 @@ def crowd(url: str, size: tuple[int, int], viewers: int, seconds: float) -> dict
     """Several viewers following the live edge: what each receives, and the cost per view."""
     seen: list[dict[str, object]] = []
     threads = [
-        threading.Thread(target=walk, args=(url, size, seconds, 360.0 * n / viewers, seen)) for n in range(viewers)
+        threading.Thread(target=walk, args=(url, size, seconds, 360.0 * n / viewers, seen))
+        for n in range(viewers)
     ]
     for thread in threads:
         thread.start()

@@ -27,7 +27,11 @@ def main() -> None:
             scores.setdefault(name, []).append(float((a & b).sum() / max((a | b).sum(), 1)))
     means = {name: round(float(np.mean(own)), 3) for name, own in scores.items()}
     lowest = round(min(min(own) for own in scores.values()), 3)
-    print(json.dumps({"mean": round(float(np.mean(list(means.values()))), 3), "lowest": lowest, "cameras": means}))
+    print(
+        json.dumps(
+            {"mean": round(float(np.mean(list(means.values()))), 3), "lowest": lowest, "cameras": means}
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -15,7 +15,9 @@ import torch
 RESULTS = Path(__file__).parent / "results"
 
 
-def timed(work: Callable[[], object], runs: int = 30, warm_up: int = 3, device: str = "cpu") -> dict[str, float]:
+def timed(
+    work: Callable[[], object], runs: int = 30, warm_up: int = 3, device: str = "cpu"
+) -> dict[str, float]:
     """Milliseconds of `work()` over `runs` calls, after `warm_up` calls that are not counted."""
     taken = []
     for run in range(-warm_up, runs):

@@ -33,7 +33,9 @@ class Kind:
 KINDS = {
     "silent": Kind(),
     "half a request": Kind(b"GET / HTTP/1.1\r\nHost: loc"),
-    "no token, 60 MB": Kind(UPGRADE.format("/ws", KEYS).encode() + b"\x82\xff" + (60_000_000).to_bytes(8, "big")),
+    "no token, 60 MB": Kind(
+        UPGRADE.format("/ws", KEYS).encode() + b"\x82\xff" + (60_000_000).to_bytes(8, "big")
+    ),
     "an upgrade that cannot be": Kind(UPGRADE.format("/ws?" + "a" * 9000, KEYS).encode()),
     "answers unread": Kind(PAGE * 200, reads=False),
     "a wrong token, messages": Kind(WRONG, b"\x81\x80\0\0\0\0" * 40_000),

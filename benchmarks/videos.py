@@ -60,7 +60,10 @@ FILMS: dict[str, tuple[str, dict[str, Any]]] = {
     "uneven intervals, MP4": ("mp4", {"options": B, "times": UNEVEN}),
     "uneven intervals, Matroska": ("mkv", {"options": B, "times": UNEVEN}),
     "an edit list that hides frames": ("mp4", {"hidden": 9, "options": {"bf": "0", "g": "250"}}),
-    "fragments without a length": ("mp4", {"options": GROUPS, "container": {"movflags": "frag_keyframe+empty_moov"}}),
+    "fragments without a length": (
+        "mp4",
+        {"options": GROUPS, "container": {"movflags": "frag_keyframe+empty_moov"}},
+    ),
     "cut off": ("mkv", {"options": GROUPS}),
 } | {f"display matrix: {name}": ("mp4", {"options": B}) for name in MATRICES}
 
@@ -78,7 +81,9 @@ def make(name: str, folder: Path) -> Path:
 def by_ffmpeg(binary: str, path: Path, size: tuple[int, int]) -> np.ndarray:
     """All frames, (time, height, width, 3)."""
     command = [binary, "-loglevel", "quiet", "-i", str(path), "-fps_mode", "passthrough"]
-    done = subprocess.run([*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], check=True, capture_output=True)
+    done = subprocess.run(
+        [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], check=True, capture_output=True
+    )
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, size[1], size[0], 3)
 
 
@@ -144,13 +149,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ffmpeg", default=shutil.which("ffmpeg"), help="the ffmpeg binary")
     binary = parser.parse_args().ffmpeg
-    print("film | frames: reference, offline, live | times off, ms | largest, mean difference | live = offline | seeks")
+    print(
+        "film | frames: reference, offline, live | times off, ms | largest, mean difference | live = offline | seeks"
+    )
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in FILMS:
             row = compare(name, Path(folder), binary)
             rows.append(row)
-            off = f"{row['offline_off']} | {row['offline_off_mean']:.2f}" if row["offline_off"] is not None else "- | -"
+            off = (
+                f"{row['offline_off']} | {row['offline_off_mean']:.2f}"
+                if row["offline_off"] is not None
+                else "- | -"
+            )
             print(
                 f"{name} | {row['frames']} | {row['times_off_ms']:.1f} | {off} | {row['live_is_offline']} | "
                 f"{row['any_order']}"

@@ -74,13 +74,17 @@ def main() -> None:
     parser.add_argument(
         "--background", choices=("black", "white"), default="black", help="background of views and truth"
     )
-    parser.add_argument("--proxy", choices=PROXIES, default="hull", help="geometry behind which views are rendered")
+    parser.add_argument(
+        "--proxy", choices=PROXIES, default="hull", help="geometry behind which views are rendered"
+    )
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each model")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
     found = {name: judge(some(name, options.size, options.views), options) for name in options.sets}
     if options.write:
-        config = {key: getattr(options, key) for key in ("models", "sets", "views", "size", "background", "proxy")}
+        config = {
+            key: getattr(options, key) for key in ("models", "sets", "views", "size", "background", "proxy")
+        }
         print(write("whole_views", "cpu", config, found))
 
 
@@ -96,7 +100,9 @@ def some(name: str, size_px: int, count: int) -> Sequence[LeaveOneOutScene]:
     return [scenes[len(scenes) * n // count] for n in range(min(count, len(scenes)))]
 
 
-def judge(scenes: Sequence[LeaveOneOutScene], options: argparse.Namespace) -> dict[str, dict[str, float | None]]:
+def judge(
+    scenes: Sequence[LeaveOneOutScene], options: argparse.Namespace
+) -> dict[str, dict[str, float | None]]:
     """Print and return the mean scores of each model."""
     scores: dict[str, list[dict[str, float | None]]] = {model: [] for model in options.models}
     scorers, metrics = Scorers(options.background), perceptual_metrics()
@@ -106,7 +112,9 @@ def judge(scenes: Sequence[LeaveOneOutScene], options: argparse.Namespace) -> di
             own = score_view(completed, truth, scorers)
             rgb = composite(options.background, completed.rgb, completed.opacity)
             rendered = composite(options.background, completed.view.rgb, completed.view.mask)
-            found = {key: getattr(own, key, None) for key in SHOWN} | detail_scores(rgb, rendered, truth, metrics)
+            found = {key: getattr(own, key, None) for key in SHOWN} | detail_scores(
+                rgb, rendered, truth, metrics
+            )
             found["calibration"] = calibration_error(rgb, completed, truth)
             scores[model].append(found)
             shown[f"{model} {own.psnr_whole:.2f} dB"] = completed.rgb
@@ -129,10 +137,15 @@ def perceptual_metrics() -> dict[str, Lpips]:
     return metrics
 
 
-def detail_scores(rgb: Tensor, rendered: Tensor, truth: TrueView, metrics: dict[str, Lpips]) -> dict[str, float | None]:
+def detail_scores(
+    rgb: Tensor, rendered: Tensor, truth: TrueView, metrics: dict[str, Lpips]
+) -> dict[str, float | None]:
     """The scores of one view that `score_view` does not have."""
     (top, bottom), (left, right) = ((int(at.min()), int(at.max()) + 1) for at in torch.nonzero(truth.mask).T)
-    box = slice(max(0, top - PADDING_PX), bottom + PADDING_PX), slice(max(0, left - PADDING_PX), right + PADDING_PX)
+    box = (
+        slice(max(0, top - PADDING_PX), bottom + PADDING_PX),
+        slice(max(0, left - PADDING_PX), right + PADDING_PX),
+    )
     found: dict[str, float | None] = {
         name: float(metric(rgb[None, :, *box], truth.rgb[None, :, *box])) for name, metric in metrics.items()
     }
@@ -148,7 +161,10 @@ def calibration_error(rgb: Tensor, completed: CompletedView, truth: TrueView) ->
     """Expected calibration error of the confidence that no channel is off by a tenth, over the predicted pixels."""
     if completed.confidence is None or not bool((inside := completed.view.error > 0).any()):
         return None
-    confidence, correct = completed.confidence[inside], ((rgb - truth.rgb).abs().amax(0) < CORRECT)[inside].float()
+    confidence, correct = (
+        completed.confidence[inside],
+        ((rgb - truth.rgb).abs().amax(0) < CORRECT)[inside].float(),
+    )
     part = (10 * confidence).long().clamp(0, 9)
     gap = torch.zeros(10).index_add_(0, part, confidence - correct)
     return float(gap.abs().sum() / len(confidence))
@@ -255,7 +271,10 @@ def save(shown: dict[str, Tensor], path: Path) -> None:
     """Write the images side by side, cropped to the subject."""
     there = torch.stack([image.amax(0) > 0 for image in shown.values()]).any(0)
     (top, bottom), (left, right) = ((int(at.min()), int(at.max()) + 1) for at in torch.nonzero(there).T)
-    part = slice(max(0, top - PADDING_PX), bottom + PADDING_PX), slice(max(0, left - PADDING_PX), right + PADDING_PX)
+    part = (
+        slice(max(0, top - PADDING_PX), bottom + PADDING_PX),
+        slice(max(0, left - PADDING_PX), right + PADDING_PX),
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     sheet = contact_sheet([[Tile(name, picture(image[:, *part])) for name, image in shown.items()]])
     cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))

@@ -15,7 +15,10 @@ from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "src"))
 
-WITH_RECIPES = {"train": ("views", "rays", "paper", "paper-small", "dstt"), "make-dataset": ("views", "rays", "paper")}
+WITH_RECIPES = {
+    "train": ("views", "rays", "paper", "paper-small", "dstt"),
+    "make-dataset": ("views", "rays", "paper"),
+}
 """Commands whose options depend on their first word, and the words to show; dstt stands for all published networks."""
 OPTION = re.compile(r"  (--\w[\w.-]*|[A-Z]\S*)(?: (\S.*?))?(?:  +(\S.*))?")
 

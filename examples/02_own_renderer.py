@@ -41,7 +41,9 @@ def render(frame: MultiViewFrame, target: Cameras, depth: torch.Tensor) -> Incom
     nearest = frame.select(names[:1])
     # From the view's pixels to points, and on to pixels of the nearest camera.
     v, u = torch.meshgrid(*(torch.arange(side) + 0.5 for side in depth.shape), indexing="ij")
-    in_view = target.K[0].inverse() @ torch.stack([u, v, torch.ones_like(u)]).reshape(3, -1) * depth.reshape(1, -1)
+    in_view = (
+        target.K[0].inverse() @ torch.stack([u, v, torch.ones_like(u)]).reshape(3, -1) * depth.reshape(1, -1)
+    )
     source_from_view = nearest.cameras.camera_from_world[0] @ target.camera_from_world[0].inverse()
     in_source = source_from_view[:3, :3] @ in_view + source_from_view[:3, 3:]
     projected = nearest.cameras.K[0] @ in_source

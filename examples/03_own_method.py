@@ -32,7 +32,9 @@ class Afterimage(Inpainter):
     def initial_state(self) -> Memory:
         return Memory()
 
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, Memory]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, Memory]:
         whole = (view.mask > 0) & (view.error == 0)
         mean = view.rgb[:, whole].mean(1) if bool(whole.any()) else view.rgb.new_zeros(3)
         fill = mean[:, None, None].expand_as(view.rgb)

@@ -2,7 +2,17 @@
 
 import torch
 
-from viewmend import Evidence, RenderConfig, Stream, StreamConfig, Studio, StudioConfig, error_rule, make_method, orbit
+from viewmend import (
+    Evidence,
+    RenderConfig,
+    Stream,
+    StreamConfig,
+    Studio,
+    StudioConfig,
+    error_rule,
+    make_method,
+    orbit,
+)
 
 THRESHOLD = 0.05
 """Spread of the source cameras' colours, in [0, 1], above which a pixel counts as wrong."""
@@ -17,7 +27,9 @@ def disagreement(evidence: Evidence) -> torch.Tensor:
 def selected(rule: str) -> float:
     """Share of the subject's pixels that a rule selects in a view of a synthetic scene."""
     studio = Studio(StudioConfig(seed=10003, cameras=6, frames=1, size_px=192))
-    stream = Stream(make_method("unfilled"), StreamConfig(render=RenderConfig(error_rule=rule)), studio.bounds)
+    stream = Stream(
+        make_method("unfilled"), StreamConfig(render=RenderConfig(error_rule=rule)), studio.bounds
+    )
     stream.add_frame(studio.read(0))
     view = stream.render(orbit([0.5], (192, 192), elevation_rad=0.3))
     return float((view.error > 0).sum() / (view.mask > 0).sum())

@@ -21,7 +21,9 @@ def main(url: str, token: str | None = None, count: int = 100, size_px: int = 25
     """Push `count` frames in real time; the number of frames that the server has."""
     studio = Studio(StudioConfig(cameras=6, frames=10, fps=FPS, size_px=size_px))
     last = -1
-    with Publisher(studio.cameras, url, token, fps=FPS, name=studio.name, up=studio.up, bounds=studio.bounds) as rig:
+    with Publisher(
+        studio.cameras, url, token, fps=FPS, name=studio.name, up=studio.up, bounds=studio.bounds
+    ) as rig:
         start = time.monotonic()
         for index in range(count):
             last = rig.push(camera_images(studio, index))

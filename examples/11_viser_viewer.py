@@ -31,7 +31,9 @@ def view_camera(camera: viser.CameraHandle, height: int) -> Cameras:
 
 def main(path: str | None = None, height: int = 256, port: int = 8080) -> viser.ViserServer:
     """Start the server, which draws a view for each client whenever its camera moves."""
-    source = prepare(open_capture(path)) if path else Studio(StudioConfig(cameras=8, frames=1, size_px=height))
+    source = (
+        prepare(open_capture(path)) if path else Studio(StudioConfig(cameras=8, frames=1, size_px=height))
+    )
     stream = Stream(load_inpainter("views"), bounds=source.bounds)
     stream.add_frame(source.read(0))
     one_at_a_time = threading.Lock()

@@ -29,12 +29,16 @@ def average_weights(models: Annotated[tuple[str, ...], tyro.conf.Positional], ou
     networks = [load_network(model) for model in models]
     for name, network in zip(models, networks, strict=True):
         if network.config != networks[0].config:
-            raise ValueError(f"expected models of the same config, got another for {name} than for {models[0]}")
+            raise ValueError(
+                f"expected models of the same config, got another for {name} than for {models[0]}"
+            )
     mean = AveragedModel(networks[0])
     for network in networks:
         mean.update_parameters(network)
     cards = "\n".join(f"#{(model_folder(model) / CARD).read_text('utf-8')}" for model in models)
-    save_inpainter(mean.module, out, f"# {out.name}\n\nThe mean of the weights of the following models.\n\n{cards}")
+    save_inpainter(
+        mean.module, out, f"# {out.name}\n\nThe mean of the weights of the following models.\n\n{cards}"
+    )
     return mean.module
 
 

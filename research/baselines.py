@@ -30,7 +30,14 @@ from stream_adapter import STREAMED, Streamed
 from torch import Tensor
 
 from viewmend.contrib.baselines.framing import DILATION_PX, Canvas, Window, window_canvas, windows_over
-from viewmend.contrib.baselines.online import Clip, OnlineConfig, OnlineInpainter, OnlineNetwork, OnlineState, Sampling
+from viewmend.contrib.baselines.online import (
+    Clip,
+    OnlineConfig,
+    OnlineInpainter,
+    OnlineNetwork,
+    OnlineState,
+    Sampling,
+)
 from viewmend.contrib.baselines.published import NETWORKS
 from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
 from viewmend.models.checkpoint import build
@@ -160,7 +167,12 @@ def baseline(name: str, framing: str, views: list[IncompleteView], context: Cont
 
 
 def timed_steps(
-    inpainter: Inpainter, state: State, view: IncompleteView, context: ContextProvider, device: str, seconds: float
+    inpainter: Inpainter,
+    state: State,
+    view: IncompleteView,
+    context: ContextProvider,
+    device: str,
+    seconds: float,
 ) -> dict[str, float]:
     """Milliseconds per step, for at least `seconds`; the first step is dropped if there are more."""
     taken: list[float] = []
@@ -204,14 +216,18 @@ def setting(view: IncompleteView) -> dict[str, object]:
     }
 
 
-def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
+def measure(
+    size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]
+) -> dict[str, object]:
     views, new_context, streamed = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
     wanted = [*product(options.networks, options.framings)]
 
-    def add(name: str, inpainter: Inpainter, state: State, view: IncompleteView, context: ContextProvider) -> None:
+    def add(
+        name: str, inpainter: Inpainter, state: State, view: IncompleteView, context: ContextProvider
+    ) -> None:
         figures[name] = timed_steps(inpainter, state, view, context, options.device, options.seconds)
         print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
         done(result)
@@ -235,7 +251,9 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument(
         "--precision", default="float32", choices=("float32", "bfloat16"), help="precision of our models"
@@ -244,10 +262,14 @@ def main() -> None:
     parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
     parser.add_argument("--framings", nargs="+", default=list(FRAMINGS), choices=FRAMINGS)
     parser.add_argument("--windows", type=int, default=1000, help="run at most this many windows of a view")
-    parser.add_argument("--seconds", type=float, default=20.0, help="time per method and size; at least one step")
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="time per method and size; at least one step"
+    )
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument("--quick", action="store_true", help="smallest size, DSTT on whole views, one step")
-    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results after each method")
+    parser.add_argument(
+        "--write", action="store_true", help="write the result to benchmarks/results after each method"
+    )
     options = parser.parse_args()
     if options.quick:
         options.networks, options.framings, options.seconds = ["dstt"], ["def"], 0.0

@@ -30,7 +30,10 @@ MAX_TRIES = 24
 
 
 def main(
-    name: tyro.conf.Positional[RigName], performers: Path | None = None, motions: Path | None = None, count: int = 30
+    name: tyro.conf.Positional[RigName],
+    performers: Path | None = None,
+    motions: Path | None = None,
+    count: int = 30,
 ) -> None:
     """Print one line for each chosen view: scene, held-out camera, hole pixels inside the true mask.
 

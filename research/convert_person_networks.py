@@ -85,7 +85,9 @@ def in_half_precision(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("wheel", type=Path, help="the wheel of mediapipe")
     parser.add_argument("out", type=Path, help="an existing folder")
     options = parser.parse_args()

@@ -130,12 +130,16 @@ class Judge:
 def good_capture(name: str, folder: Path) -> Path:
     """A studio capture, or a small part of a real one."""
     if name == "studio":
-        source = Studio(StudioConfig(seed=10002, cameras=8, frames=10, fps=15, size_px=192, background="stage"))
+        source = Studio(
+            StudioConfig(seed=10002, cameras=8, frames=10, fps=15, size_px=192, background="stage")
+        )
     else:
         opened = open_capture(name)
         opened = open_capture(name, opened.cameras.names[:: -(-len(opened.cameras) // MOST_CAMERAS)])
         source = CaptureSubset(
-            opened, times=range(min(len(opened.frame_ids), 10)), scale=LONGEST_PX / max(opened.cameras.max_size_px)
+            opened,
+            times=range(min(len(opened.frame_ids), 10)),
+            scale=LONGEST_PX / max(opened.cameras.max_size_px),
         )
     write_capture(source, folder / "good", images="png")
     for file in (folder / "good/mask").glob("*/*.png"):  # two levels, as in masks of other tools

@@ -46,7 +46,9 @@ class Corruption:
             for file in self.files(stream, camera):
                 assert cv2.imwrite(str(file), change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
 
-    def pose(self, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], every: bool) -> None:
+    def pose(
+        self, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], every: bool
+    ) -> None:
         for camera in self.cameras if every else [self.one]:
             R, t = change(np.array(camera["R"]), np.array(camera["t"]))
             camera["R"], camera["t"] = R.tolist(), t.tolist()
@@ -94,7 +96,9 @@ def turned(s: Corruption) -> str:
 
 def displaced(s: Corruption) -> str:
     centre = -np.array(s.one["R"]).T @ np.array(s.one["t"])
-    far = float(np.linalg.norm(centre - _middle(s))) * float(np.exp(s.rng.uniform(math.log(0.003), math.log(0.3))))
+    far = float(np.linalg.norm(centre - _middle(s))) * float(
+        np.exp(s.rng.uniform(math.log(0.003), math.log(0.3)))
+    )
     step = s.rng.normal(size=3)
     s.pose(lambda R, t: (R, t + far * step / np.linalg.norm(step)), False)
     return f"one camera displaced by {far:.3g} units"
@@ -123,7 +127,9 @@ def centre(s: Corruption) -> str:
         K[:2, 2] += shift
 
     s.intrinsics(change, every)
-    return f"principal point off by ({shift[0]:.1f}, {shift[1]:.1f}), {'all cameras' if every else 'one camera'}"
+    return (
+        f"principal point off by ({shift[0]:.1f}, {shift[1]:.1f}), {'all cameras' if every else 'one camera'}"
+    )
 
 
 def pixel_centre(s: Corruption) -> str:
@@ -240,9 +246,9 @@ def mask(s: Corruption) -> str:
         f"widened by {size}": lambda i: cv2.dilate(i, kernel),
         f"narrowed by {size}": lambda i: cv2.erode(i, kernel),
         f"without {100 * share:.0f} % of the subject": cut,
-        "salted": lambda i: np.where(s.rng.random(i.shape[:2] + (1,) * (i.ndim - 2)) < 0.02, 255 - i, i).astype(
-            np.uint8
-        ),
+        "salted": lambda i: np.where(
+            s.rng.random(i.shape[:2] + (1,) * (i.ndim - 2)) < 0.02, 255 - i, i
+        ).astype(np.uint8),
     }
     name = str(s.rng.choice(list(changes)))
     every = name in ("inverted", "of 0 and 1", "upside down", "mirrored") and bool(s.rng.random() < 0.5)
@@ -273,7 +279,9 @@ def film(path: Path, files: list[Path], fps: int, times: list[int]) -> None:
         stream.pix_fmt, stream.options = "yuv444p", {"crf": "4", "preset": "veryfast"}
         stream.codec_context.time_base = Fraction(1, fps)
         for time, file in zip(times, files, strict=True):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(cv2.imread(str(file))[..., ::-1]), "rgb24")
+            frame = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(cv2.imread(str(file))[..., ::-1]), "rgb24"
+            )
             frame.pts, frame.time_base = time, Fraction(1, fps)
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
@@ -304,7 +312,12 @@ def films(s: Corruption) -> str:
             own, rate = (frames, fps if times else fps // 2) if bad else (list(range(count)), fps)
             files = s.files(stream, camera)
             place = f"films/{stream}_{camera['name']}.mp4"
-            film(s.folder / place, [files[n] for n in own], rate, (times or list(range(len(own)))) if bad else own)
+            film(
+                s.folder / place,
+                [files[n] for n in own],
+                rate,
+                (times or list(range(len(own)))) if bad else own,
+            )
             camera["video" if stream == "image" else "mask"] = place
         del camera["image"]
     return f"film: {name}{' (all)' if cameras == half else ''}"
@@ -351,7 +364,8 @@ def file_names(s: Corruption) -> str:
 
 
 CALIBRATION = (
-    r"calibration|camera_from_world|camera-to-world|OpenGL|axes|rotation|principal|\bK\b|focal|unit|distortion"
+    r"calibration|camera_from_world|camera-to-world|OpenGL|axes|rotation|"
+    r"principal|\bK\b|focal|unit|distortion"
 )
 CAUSES: dict[Callable[[Corruption], str], str] = {
     poses: CALIBRATION, unit: rf"metres|{CALIBRATION}", turned: CALIBRATION, displaced: CALIBRATION,

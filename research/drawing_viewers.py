@@ -163,7 +163,14 @@ async def stall(address: str, end: float) -> None:
         try:
             socket = await websockets.connect(f"ws://{host}:{port}/ws", compression=None, max_queue=1)
             await socket.send(json.dumps({"type": "hello", "version": 1, "codecs": ["jpeg"]}))
-            look = {"type": "look", "id": 1, "camera": {"azimuth": 10}, "width": 640, "height": 640, "quality": 95}
+            look = {
+                "type": "look",
+                "id": 1,
+                "camera": {"azimuth": 10},
+                "width": 640,
+                "height": 640,
+                "quality": 95,
+            }
             await socket.send(json.dumps(look))
             socket.transport.pause_reading()
             _, writer = await asyncio.open_connection(host, int(port), limit=1024)  # reads no more than that
@@ -188,7 +195,9 @@ def resident_mb(pid: int) -> float:
 async def measure(address: str, pid: int, viewers: int, options: argparse.Namespace) -> None:
     begun = time.monotonic()
     end = begun + options.first + options.seconds
-    crowd = [Viewer(address, 360 * n / max(1, viewers), options.playing, options.forget) for n in range(viewers)]
+    crowd = [
+        Viewer(address, 360 * n / max(1, viewers), options.playing, options.forget) for n in range(viewers)
+    ]
     tasks = [asyncio.create_task(viewer.run(n * ARRIVAL_S / viewers, end)) for n, viewer in enumerate(crowd)]
     tasks += [asyncio.create_task(stall(address, end)) for _ in range(options.idle)]
     total = lambda name: sum(getattr(viewer, name) for viewer in crowd)  # noqa: E731
@@ -210,8 +219,13 @@ async def measure(address: str, pid: int, viewers: int, options: argparse.Namesp
             "part": "first" if n == 0 else "after",
             "cores": round((now[0] - last[0]) / taken, 4),
         }
-        row |= rate | {"wait_ms_p50_p99_max": [round(waits[int(q * (len(waits) - 1))], 1) for q in (0.5, 0.99, 1)]}
-        print(json.dumps(row | {"resident_mb": round(resident_mb(pid), 1), "load": os.getloadavg()[0]}), flush=True)
+        row |= rate | {
+            "wait_ms_p50_p99_max": [round(waits[int(q * (len(waits) - 1))], 1) for q in (0.5, 0.99, 1)]
+        }
+        print(
+            json.dumps(row | {"resident_mb": round(resident_mb(pid), 1), "load": os.getloadavg()[0]}),
+            flush=True,
+        )
         last = now
     for result in await asyncio.gather(*tasks, return_exceptions=True):
         if isinstance(result, Exception):
@@ -219,11 +233,17 @@ async def measure(address: str, pid: int, viewers: int, options: argparse.Namesp
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--source", default="studio", help="a capture, or the synthetic studio")
-    parser.add_argument("--playing", action="store_true", help="viewers follow the recording; without, they orbit")
+    parser.add_argument(
+        "--playing", action="store_true", help="viewers follow the recording; without, they orbit"
+    )
     parser.add_argument("--viewers", type=int, nargs="+", default=[0, 1, 8, 64])
-    parser.add_argument("--forget", type=float, default=math.inf, help="seconds after which caches are emptied")
+    parser.add_argument(
+        "--forget", type=float, default=math.inf, help="seconds after which caches are emptied"
+    )
     parser.add_argument("--idle", type=int, default=0, help="viewers who read nothing")
     parser.add_argument("--first", type=float, default=5.0, help="seconds in which viewers arrive")
     parser.add_argument("--seconds", type=float, default=10.0)
@@ -239,7 +259,9 @@ def main() -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
-            address = next(found.group() for line in server.stdout if (found := re.search(r"http://\S+", line)))
+            address = next(
+                found.group() for line in server.stdout if (found := re.search(r"http://\S+", line))
+            )
             time.sleep(20)
             for viewers in options.viewers:
                 asyncio.run(measure(address.rstrip("/"), server.pid, viewers, options))

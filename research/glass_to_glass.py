@@ -69,7 +69,9 @@ def served(options: list[str]) -> Iterator[str]:
 
 def send(address: str, options: argparse.Namespace, results: Connection) -> None:
     """Push frames for some seconds; gives the time at which each was handed over."""
-    studio = Studio(StudioConfig(seed=10021, cameras=options.cameras, size_px=options.size, fps=options.fps, frames=8))
+    studio = Studio(
+        StudioConfig(seed=10021, cameras=options.cameras, size_px=options.size, fps=options.fps, frames=8)
+    )
     frames = [studio.read(n) for n in range(8)]
     colours = torch.tensor(CODES, dtype=torch.uint8)
     sent: list[float] = []
@@ -90,9 +92,12 @@ def latencies(sent: list[float], seen: list[list[float]]) -> list[float]:
     """Milliseconds from a frame's sending to its first paint, of the frames that were shown."""
     first: dict[int, float] = {}
     for at, *rgb in seen:
-        code = min(range(len(CODES)), key=lambda n: max(abs(a - b) for a, b in zip(rgb, CODES[n], strict=True)))
+        code = min(
+            range(len(CODES)), key=lambda n: max(abs(a - b) for a, b in zip(rgb, CODES[n], strict=True))
+        )
         newest = max(
-            (n for n, time_s in enumerate(sent) if time_s <= at and STEP * n % len(CODES) == code), default=None
+            (n for n, time_s in enumerate(sent) if time_s <= at and STEP * n % len(CODES) == code),
+            default=None,
         )
         if newest is not None:
             first.setdefault(newest, at)
@@ -100,7 +105,9 @@ def latencies(sent: list[float], seen: list[list[float]]) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cameras", type=int, default=8)
     parser.add_argument("--size", type=int, default=320, help="side of the cameras' images")
     parser.add_argument("--fps", type=float, default=15.0)

@@ -71,9 +71,13 @@ def parity(device: str) -> dict[str, object]:
     for model in MODELS:
         pairs = zip(views(model, "cpu", 3), views(model, device, 3), strict=True)
         squares = [float((one - other).square().mean()) for one, other in pairs]
-        figures[model] = round(min(99.0, *(-10 * torch.tensor(max(s, 1e-12)).log10().item() for s in squares)), 1)
+        figures[model] = round(
+            min(99.0, *(-10 * torch.tensor(max(s, 1e-12)).log10().item() for s in squares)), 1
+        )
     if worst := [model for model, db in figures.items() if db < LARGEST_DB_BELOW]:
-        raise SystemExit(f"{json.dumps(figures)}\nexpected {LARGEST_DB_BELOW} dB or more between devices, got {worst}")
+        raise SystemExit(
+            f"{json.dumps(figures)}\nexpected {LARGEST_DB_BELOW} dB or more between devices, got {worst}"
+        )
     return figures
 
 
@@ -98,7 +102,9 @@ def profile(device: str) -> dict[str, object]:
         rows = took.key_averages()
         own = sorted(rows, key=lambda row: -max(row.self_device_time_total, row.self_cpu_time_total))
         waits = {row.key: row.count for row in rows if row.key in WAITS}
-        longest = {row.key: [round(row.self_cpu_time_total), round(row.self_device_time_total)] for row in own[:20]}
+        longest = {
+            row.key: [round(row.self_cpu_time_total), round(row.self_device_time_total)] for row in own[:20]
+        }
         figures[model] = {"waits_a_view": waits, "longest_us_cpu_and_device": longest}
     return figures
 
@@ -112,7 +118,8 @@ def commands(device: str) -> dict[str, list[str]]:
     own = [sys.executable, str(HERE / "gpu_first_hour.py"), "--device", device, "--step"]
     tests = [sys.executable, "-m", "pytest", "-q", "-m", "gpu", str(HERE.parent / "tests")]
     timings = {
-        name: [sys.executable, str(HERE.parent / "benchmarks" / f"{name}.py"), "--device", device] for name in TIMINGS
+        name: [sys.executable, str(HERE.parent / "benchmarks" / f"{name}.py"), "--device", device]
+        for name in TIMINGS
     }
     return {"tests": tests, "parity": [*own, "parity"], **timings, "profile": [*own, "profile"]}
 
@@ -125,7 +132,16 @@ def training(out: Path, minutes: float) -> dict[str, list[str]]:
     def learn(name: str, command: list[str], *options: str) -> list[str]:
         before = training_of(out / name)
         total = SHARES[name] * minutes + (before.minutes if before else 0)
-        return [*command, "--shards", windows, "--out", str(out / name), "--minutes", f"{total:.2f}", *options]
+        return [
+            *command,
+            "--shards",
+            windows,
+            "--out",
+            str(out / name),
+            "--minutes",
+            f"{total:.2f}",
+            *options,
+        ]
 
     workers = ("--workers", str(os.cpu_count() or 1), "--count", "100000")
     return {
@@ -172,7 +188,9 @@ def run(command: list[str], limit_s: float) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--minutes", type=float, default=10.0, help="total; training gets the rest")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))

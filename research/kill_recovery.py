@@ -100,7 +100,10 @@ class Area:
 
             def hook(event: str, arguments: tuple[object, ...]) -> None:
                 nonlocal count
-                if event not in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") or os.getpid() != own:
+                if (
+                    event not in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir")
+                    or os.getpid() != own
+                ):
                     return
                 path = os.fspath(arguments[0]) if isinstance(arguments[0], str | os.PathLike) else ""
                 written = event != "open" or (
@@ -205,7 +208,9 @@ def check(command: str, points: int, folder: Path) -> Outcome:
                 faults = _faults_after_signal(Area(place, command), number, sent, set(whole))
             outcome.killed += sent == signal.SIGKILL
             outcome.ended += sent == signal.SIGTERM
-            outcome.faults += [f"{sent.name} at {number} ({lines[number - 1][-80:]}): {fault}" for fault in faults]
+            outcome.faults += [
+                f"{sent.name} at {number} ({lines[number - 1][-80:]}): {fault}" for fault in faults
+            ]
     for part in SPACE_FRACTIONS:
         with contextlib.suppress(subprocess.CalledProcessError, FileNotFoundError):
             with disk(folder, int(part * room)) as place:
@@ -236,7 +241,9 @@ def _faults_on_full_disk(area: Area) -> list[str]:
     code, said, _ = area.run()
     errors = [line for line in said.splitlines() if line.startswith("viewmend: error:")]
     good = code == 2 and len(errors) == 1 and str(area.root) in errors[0] and "Traceback" not in said
-    return ([] if good else [f"exit code {code}, {said[-600:]}"]) + [f"left {n}" for n in area.unfinished(False)]
+    return ([] if good else [f"exit code {code}, {said[-600:]}"]) + [
+        f"left {n}" for n in area.unfinished(False)
+    ]
 
 
 def main() -> int:
@@ -267,7 +274,8 @@ def main() -> int:
                 command = command.replace(word, str(path))
             one = outcomes[name] = check(command, given.points, folder)
             print(
-                f"| {name} | {one.points} | {one.killed} | {one.ended} | {one.full} | {len(one.faults)} |", flush=True
+                f"| {name} | {one.points} | {one.killed} | {one.ended} | {one.full} | {len(one.faults)} |",
+                flush=True,
             )
             print(*one.faults, f"{time.monotonic() - began:.0f} s", sep="\n", file=sys.stderr, flush=True)
     if given.write:

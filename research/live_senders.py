@@ -94,7 +94,9 @@ def packets(path: str, epoch_s: float, phase_s: float) -> Iterator[tuple[av.Pack
         n += 1
 
 
-def send_packets(out, path: str, epoch_s: float, phase_s: float, ppm: float, format_name: str, options: dict) -> None:
+def send_packets(
+    out, path: str, epoch_s: float, phase_s: float, ppm: float, format_name: str, options: dict
+) -> None:
     """Mux the packets. The sender's clock has an arbitrary start and is off by `ppm` millionths."""
     with av.open(path) as video, av.open(out, "w", format=format_name, options=options) as container:
         stream = container.add_stream_from_template(video.streams.video[0])
@@ -178,11 +180,15 @@ class _Pipe(io.RawIOBase):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kind", choices=("udp", "rtsp", "http", "mjpeg"), help="how the video is sent")
     parser.add_argument("video", help="the camera's file")
     parser.add_argument("port", type=int, help="port on this machine")
-    parser.add_argument("epoch", type=float, help="when the first image is sent: seconds of the monotonic clock")
+    parser.add_argument(
+        "epoch", type=float, help="when the first image is sent: seconds of the monotonic clock"
+    )
     parser.add_argument("phase", type=float, help="seconds by which this camera is late")
     parser.add_argument("ppm", type=float, help="parts per million by which this camera's clock is fast")
     options = parser.parse_args()

@@ -59,7 +59,9 @@ class Senders:
             f"{self.phases_s[name]}",
             f"{ppm}",
         ]
-        self._processes[name] = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._processes[name] = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
 
     def first_sent_s(self, name: str) -> float:
         """Time at which the camera sent its first image."""
@@ -118,7 +120,9 @@ class Watch:
                 if frame is not None:
                     rgb = frame.rgb.permute(0, 2, 3, 1).numpy()
                     names = frame.cameras.names
-                    self.seen.append((now_s, {n: number_of(rgb[v], self._plates[n]) for v, n in enumerate(names)}))
+                    self.seen.append(
+                        (now_s, {n: number_of(rgb[v], self._plates[n]) for v, n in enumerate(names)})
+                    )
 
     def spreads_s(self) -> list[tuple[float, float, float]]:
         """For each frame: arrival time, seconds between its first and last image, and the age of the oldest."""
@@ -144,7 +148,9 @@ class Watch:
 
     def back_s(self, name: str, since_s: float) -> float | None:
         """When a camera first appeared again."""
-        return next((now_s for now_s, numbers in list(self.seen) if now_s > since_s and name in numbers), None)
+        return next(
+            (now_s for now_s, numbers in list(self.seen) if now_s > since_s and name in numbers), None
+        )
 
 
 def run(options: argparse.Namespace, fps: float, videos: Path, folder: Path) -> dict[str, object]:
@@ -168,7 +174,11 @@ def run(options: argparse.Namespace, fps: float, videos: Path, folder: Path) -> 
         while time.monotonic() < ends_s:
             time.sleep(0.5)
             memory_mb.append(round((resident_bytes() or 0) / 1e6, 1))
-            if kinds is not None and not options.no_kill and next_s < time.monotonic() < ends_s - AWAY_S - EVERY_S:
+            if (
+                kinds is not None
+                and not options.no_kill
+                and next_s < time.monotonic() < ends_s - AWAY_S - EVERY_S
+            ):
                 name = senders.names[victim % len(KINDS)]
                 senders.kill(name)
                 killed_s = time.monotonic()
@@ -217,7 +227,12 @@ def results(watch: Watch, memory_mb: list[float], returns: list[dict], counts: d
         "spread_last_third_ms": summarise(spread_ms[-third:]),
         "beyond_half_a_frame": round(sum(ms > half for ms in spread_ms) / len(spread_ms), 4),
         "age_ms": summarise([1000 * age_s for _, _, age_s in settled]),
-        "memory_mb": {"early": early, "late": late, "most": max(memory_mb), "growth": round(late / early - 1, 4)},
+        "memory_mb": {
+            "early": early,
+            "late": late,
+            "most": max(memory_mb),
+            "growth": round(late / early - 1, 4),
+        },
         "returns": returns,
         "slowest_return_s": max((r["back_s"] or 99.0 for r in returns), default=None),
         "strays": watch.strays(),
@@ -247,11 +262,15 @@ def is_good(done: dict) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--fps", type=float, nargs="+", default=[15.0], help="rates of the rig; cameras always send 15")
+    parser.add_argument(
+        "--fps", type=float, nargs="+", default=[15.0], help="rates of the rig; cameras always send 15"
+    )
     parser.add_argument("--scale", type=float, default=0.5, help="scale at which masks are computed")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--videos", type=Path, help="folder to keep the videos in")
-    parser.add_argument("--files", action="store_true", help="read the videos as if they were live, without a network")
+    parser.add_argument(
+        "--files", action="store_true", help="read the videos as if they were live, without a network"
+    )
     parser.add_argument("--no-kill", action="store_true")
     parser.add_argument("--picture", type=Path, help="write the last frame and its masks")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
@@ -264,7 +283,12 @@ def main() -> int:
     print(json.dumps(done, indent=1))
     if options.write:
         config = {"cameras": len(KINDS), "size": SIZE_PX, "kinds": "files" if options.files else KINDS}
-        config |= {"cameras_fps": FPS, "mask_scale": options.scale, "seconds": options.seconds, "nice": os.nice(0)}
+        config |= {
+            "cameras_fps": FPS,
+            "mask_scale": options.scale,
+            "seconds": options.seconds,
+            "nice": os.nice(0),
+        }
         print(write(f"live_sources{'_files' if options.files else ''}", "cpu", config, done))
     return 0 if all(map(is_good, done.values())) else 1
 

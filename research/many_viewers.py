@@ -65,12 +65,17 @@ def processes(server: subprocess.Popen, title: str) -> list[int]:
     def is_ours(pid: int) -> bool:
         return pid == server.pid or (pid in parents and is_ours(parents[pid]))
 
-    return sorted((pid for pid in titles if titles[pid].startswith(title) and is_ours(pid)), key=lambda pid: born[pid])
+    return sorted(
+        (pid for pid in titles if titles[pid].startswith(title) and is_ours(pid)), key=lambda pid: born[pid]
+    )
 
 
 def answering(address: str, dead: int) -> int:
     """Process id of the replica that answers; `dead` if none does."""
-    with contextlib.suppress(OSError), urllib.request.urlopen(f"http://{address}/health", timeout=30) as answer:
+    with (
+        contextlib.suppress(OSError),
+        urllib.request.urlopen(f"http://{address}/health", timeout=30) as answer,
+    ):
         return json.load(answer)["process"]
     return dead
 
@@ -160,7 +165,12 @@ def kill_repeatedly(kills: int) -> dict[str, object]:
             news = [[at - start for at, by in list(w.arrived) if by > had[w]] for w in walkers]
             gone = sum(not new and w.arrived[-1][0] < start + 1 for w, new in zip(walkers, news, strict=True))
             until(lambda: answering(address, oldest) not in (oldest, newest), 300)  # noqa: B023
-            print([round(new[0], 2) for new in news if new], round(time.monotonic() - start, 1), gone, flush=True)
+            print(
+                [round(new[0], 2) for new in news if new],
+                round(time.monotonic() - start, 1),
+                gone,
+                flush=True,
+            )
             if watch.stopped_at > start - 3:
                 void += 1
                 continue
@@ -205,7 +215,10 @@ def status_mb(pid: int, key: str) -> float:
 
 def many_frames(frames: int) -> dict[str, object]:
     """Memory while many small frames are received; the first tenth fills the stores."""
-    with served(*LONG, "--model", "nearest", "--budget-ms", "0") as (server, address), walking(address, 64) as walkers:
+    with (
+        served(*LONG, "--model", "nearest", "--budget-ms", "0") as (server, address),
+        walking(address, 64) as walkers,
+    ):
         taken = lambda: sum(len(walker.arrived) for walker in walkers)  # noqa: E731
         samples, begun = [], time.monotonic()
         for part in range(1, 11):
@@ -238,7 +251,10 @@ def main() -> None:
     if options.write:
         print(
             write(
-                "many_viewers", "cpu", {"viewers": VIEWERS, "studio": STUDIO, "long": LONG, "side_px": SEEN_PX}, figures
+                "many_viewers",
+                "cpu",
+                {"viewers": VIEWERS, "studio": STUDIO, "long": LONG, "side_px": SEEN_PX},
+                figures,
             )
         )
 

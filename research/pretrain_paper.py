@@ -86,10 +86,14 @@ def random_crop(sample: Sample, config: PaperConfig) -> Float[Tensor, "channel c
     return image.channels[number, :, top : top + CROP_PX, left : left + CROP_PX]
 
 
-def reproduce(model: PatchTransformer, crops: Float[Tensor, "crop channel side side"]) -> tuple[Tensor, Tensor]:
+def reproduce(
+    model: PatchTransformer, crops: Float[Tensor, "crop channel side side"]
+) -> tuple[Tensor, Tensor]:
     """The patches (patch, 3, 28, 28) of crops that show the subject, decoded from their own tokens and as they are."""
     count = STEPS_A_SIDE + 1
-    places = torch.cartesian_prod(torch.arange(len(crops)), torch.arange(count), torch.arange(count)).to(crops.device)
+    places = torch.cartesian_prod(torch.arange(len(crops)), torch.arange(count), torch.arange(count)).to(
+        crops.device
+    )
     patches = split(crops, places, PATCH_PX, STEP_PX)
     shown = (patches[:, MASK_CHANNEL] > 0).flatten(1).any(1)
     with model.autocast():

@@ -135,7 +135,9 @@ class Soak:
             asked = urllib.request.Request(f"{url}/path.mp4{token_query(TOKEN)}", body)
             leaves = chance.random() < 0.5
             try:
-                with urllib.request.urlopen(asked, timeout=chance.uniform(0.2, 1.5) if leaves else 60) as answer:
+                with urllib.request.urlopen(
+                    asked, timeout=chance.uniform(0.2, 1.5) if leaves else 60
+                ) as answer:
                     self.counts["exports"] += answer.read()[4:8] == b"ftyp"
             except (TimeoutError, OSError):
                 self.counts["exports_abandoned"] += 1
@@ -194,7 +196,14 @@ def main() -> int:
             if late_s > 1:
                 paused_s, soak.ends = paused_s + late_s, soak.ends + late_s
             memory.append(round(memory_mb(server.pid), 1))
-            print(round(soak.ends - time.monotonic()), "s left:", memory[-1], "MB", dict(soak.counts), flush=True)
+            print(
+                round(soak.ends - time.monotonic()),
+                "s left:",
+                memory[-1],
+                "MB",
+                dict(soak.counts),
+                flush=True,
+            )
         alive = server.poll() is None
         for thread in threads:
             thread.join(20)
@@ -203,7 +212,9 @@ def main() -> int:
         server.send_signal(signal.SIGINT)
         server.wait(30)
     fifth = max(1, len(memory) // 5)
-    early, late = (statistics.median(part or [0.0]) for part in (memory[fifth : 3 * fifth], memory[3 * fifth :]))
+    early, late = (
+        statistics.median(part or [0.0]) for part in (memory[fifth : 3 * fifth], memory[3 * fifth :])
+    )
     growth = late / early - 1 if early else 0.0
     results = {
         "minutes": options.minutes,

@@ -27,8 +27,12 @@ class Streamed(Inpainter):
     def initial_state(self) -> State:
         return State()
 
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, State]:
         memory: Memory = {}
-        own = ContextProvider(self._views, RenderQuality(refine_fraction=self.fraction), memory=lambda _: memory)
+        own = ContextProvider(
+            self._views, RenderQuality(refine_fraction=self.fraction), memory=lambda _: memory
+        )
         view = decide_error_mask(view, None, "all", self.fraction, self.net, own)
         return self.net.step(view, own, state)

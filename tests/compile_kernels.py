@@ -14,7 +14,9 @@ def main() -> None:
     studio = Studio(StudioConfig(cameras=5, frames=1, size_px=96, background="stage"))
     frame = studio.read(0)
     held = frame.cameras.names[0]
-    stream = Stream(load_inpainter("views"), StreamConfig(render=RenderConfig(error_rule="all")), studio.bounds)
+    stream = Stream(
+        load_inpainter("views"), StreamConfig(render=RenderConfig(error_rule="all")), studio.bounds
+    )
     stream.add_frame(frame.without([held]))
     stream.view(frame.cameras.select([held]))
 

@@ -51,7 +51,9 @@ def test_a_model_that_paints_on_white_is_scored_on_white(snow):
     assert step.background == "white" and view.holes.sum() > 3
     for image in (step.completed_rgb, step.rendered, step.truth):
         assert float(image[:, ~subject & (view.mask == 0)].min()) == 1
-    assert float(step.completed_rgb[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
+    assert (
+        float(step.completed_rgb[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
+    )
     torch.testing.assert_close(step.completed_rgb, torch.where(view.error > 0, 1.0, step.rendered))
     assert scores.ours.psnr_whole == pytest.approx(psnr(step.completed_rgb, step.truth))
     assert scores.ours.ssim_whole == pytest.approx(float(ssim_map(step.completed_rgb, step.truth).nanmean()))

@@ -37,7 +37,9 @@ TOLERANCE = 1e-4
 @pytest.fixture(scope="module")
 def model() -> PatchTransformer:
     torch.manual_seed(0)
-    return PatchTransformer(replace(paper_small(), widths=(8,) * 9, dim=64, heads=4, k_w=2, n_w=1, n_c=2)).eval()
+    return PatchTransformer(
+        replace(paper_small(), widths=(8,) * 9, dim=64, heads=4, k_w=2, n_w=1, n_c=2)
+    ).eval()
 
 
 @pytest.fixture
@@ -117,7 +119,9 @@ def test_every_camera_image_is_encoded_once_for_all_viewers(model, encoded):
 @pytest.mark.parametrize("name", ["model", "views", "predicted"])
 def test_the_first_view_of_a_frame_is_charged_for_shared_work(model, name):
     """`predicted`: the first to encode cameras is the prediction of errors."""
-    render = RenderConfig(error_rule="predicted", refine_fraction=0.5) if name == "predicted" else CONFIG.render
+    render = (
+        RenderConfig(error_rule="predicted", refine_fraction=0.5) if name == "predicted" else CONFIG.render
+    )
     stream = Stream(model if name == "model" else load_inpainter("views"), replace(CONFIG, render=render))
     stream.add_frame(photograph(SPARSE, 0))
     first, second = stream.view(A).times, stream.view(A).times
@@ -147,7 +151,9 @@ def test_cameras_of_different_sizes_are_used(model, inpainter):
     stream = Stream(model if inpainter == "model" else ReprojectionFill(3), CONFIG)
     stream.add_frame(MultiViewFrame(replace(SPARSE, size_px=sizes), rgb, mask, 0))
     seen = stream.view(A, None, exclude=("c9",))
-    assert seen.completed.view.source_views and (seen.completed.rgb - seen.completed.view.rgb).abs().max() > 0.05
+    assert (
+        seen.completed.view.source_views and (seen.completed.rgb - seen.completed.view.rgb).abs().max() > 0.05
+    )
 
 
 def test_a_cached_frame_is_not_replaced(model):
@@ -189,7 +195,9 @@ def test_views_of_another_renderer_are_completed(model):
     error = torch.zeros_like(mask)
     error[20:28, 20:28] = 1
     names = ("c4", "c7", "c2")
-    view = IncompleteView(A, rgb * (1 - error), mask, error, depth, names, torch.ones(3, 48, 48) / 3, 0, names)
+    view = IncompleteView(
+        A, rgb * (1 - error), mask, error, depth, names, torch.ones(3, 48, 48) / 3, 0, names
+    )
     mended = stream.mend(view)
     assert torch.equal(mended.completed.rgb[:, error == 0], view.rgb[:, error == 0])
     assert (mended.completed.rgb - view.rgb)[:, error > 0].abs().mean() > 0.01
@@ -244,7 +252,9 @@ def test_non_finite_results_are_refused(part, value):
     stream = Stream(Broken(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
     for look in (stream.view, lambda camera: stream.mend(stream.render(camera))):
-        with pytest.raises(ValueError, match=rf"Broken: expected `step` .* numbers in {part} that are not finite"):
+        with pytest.raises(
+            ValueError, match=rf"Broken: expected `step` .* numbers in {part} that are not finite"
+        ):
             look(A)
 
 
@@ -261,13 +271,22 @@ def with_rgb(view, rgb):
         (lambda view, state: CompletedView(view, view.rgb), "a CompletedView alone"),
         (lambda view, state: view.rgb, "a Tensor alone"),
         (lambda view, state: (view.rgb, state), r"\(Tensor, State\)"),
-        (lambda view, state: (with_rgb(view, (255 * view.rgb).byte()), state), r"rgb as torch\.uint8 of shape \(3, "),
+        (
+            lambda view, state: (with_rgb(view, (255 * view.rgb).byte()), state),
+            r"rgb as torch\.uint8 of shape \(3, ",
+        ),
         (lambda view, state: (with_rgb(view, 255 * view.rgb), state), r"rgb from 0 to \d\d"),
         (lambda view, state: (with_rgb(view, view.rgb - 1), state), "rgb from -1 to"),
-        (lambda view, state: (with_rgb(view, view.rgb.movedim(0, -1)), state), r"rgb as .* of shape \(\d+, \d+, 3\)"),
+        (
+            lambda view, state: (with_rgb(view, view.rgb.movedim(0, -1)), state),
+            r"rgb as .* of shape \(\d+, \d+, 3\)",
+        ),
         (lambda view, state: (with_rgb(view, view.rgb.numpy()), state), "rgb as ndarray"),
         (lambda view, state: (with_rgb(view, None), state), "rgb as NoneType"),
-        (lambda view, state: (CompletedView(view, view.rgb, alpha=2 * view.mask), state), "alpha from 0 to 2"),
+        (
+            lambda view, state: (CompletedView(view, view.rgb, alpha=2 * view.mask), state),
+            "alpha from 0 to 2",
+        ),
     ],
 )
 def test_what_a_step_returns_is_checked(returned, got):
@@ -277,7 +296,9 @@ def test_what_a_step_returns_is_checked(returned, got):
 
     stream = Stream(Own(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
-    with pytest.raises(ValueError, match=rf"Own: expected `step` to return \(CompletedView, State\), .* got {got}.*; "):
+    with pytest.raises(
+        ValueError, match=rf"Own: expected `step` to return \(CompletedView, State\), .* got {got}.*; "
+    ):
         stream.view(A)
 
 
@@ -285,13 +306,17 @@ def test_what_a_step_returns_is_checked(returned, got):
 def test_a_step_may_round_and_return_any_floats(dtype):
     class Rounding(Inpainter):
         def step(self, view, context, state):
-            completed = CompletedView(view, (view.rgb + 0.001).to(dtype), view.mask.to(dtype), view.mask.to(dtype))
+            completed = CompletedView(
+                view, (view.rgb + 0.001).to(dtype), view.mask.to(dtype), view.mask.to(dtype)
+            )
             return completed, state
 
     stream = Stream(Rounding(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
     completed = stream.view(A).completed
-    assert float(completed.rgb.max()) > 0 and {image.dtype for image in completed.images.values()} == {torch.float32}
+    assert float(completed.rgb.max()) > 0 and {image.dtype for image in completed.images.values()} == {
+        torch.float32
+    }
     assert draw_mode(completed, "confidence", "ff0000").any(), "NumPy has no bfloat16"
 
 
@@ -346,7 +371,9 @@ def test_a_view_is_rendered_and_completed():
 
 
 def test_past_frames_are_kept_as_far_back_as_windows_reach():
-    requester = Requester((0, ("c4",)), (2, ("c9", "c0")), (WINDOW, ("c1",)), (WINDOW + 1, ("c1",)), (-1, ("c1",)))
+    requester = Requester(
+        (0, ("c4",)), (2, ("c9", "c0")), (WINDOW, ("c1",)), (WINDOW + 1, ("c1",)), (-1, ("c1",))
+    )
     stream = Stream(requester, replace(CONFIG, memory_mb=None))
     for time in (0, 1, WINDOW - 1, WINDOW + 1):
         stream.add_frame(photograph(SPARSE, time))
@@ -387,7 +414,9 @@ def test_a_string_as_exclude_is_refused():
     stream.add_frame(photograph(SPARSE))
     view = stream.render(A)
     for look in (stream.view, stream.render, lambda _, exclude: stream.mend(view, exclude=exclude)):
-        with pytest.raises(ValueError, match=r"exclude as a list of names, got the string 'c4'; write \['c4'\]"):
+        with pytest.raises(
+            ValueError, match=r"exclude as a list of names, got the string 'c4'; write \['c4'\]"
+        ):
             look(A, exclude="c4")
     assert not requester.given
 
@@ -421,7 +450,10 @@ def test_settings_may_be_numbers_of_numpy():
         (lambda: RenderConfig(cameras=0), "source cameras, at least 1, got 0"),
         (lambda: RenderConfig(cameras=-1), "source cameras, at least 1, got -1"),
         (forged(RenderConfig(), cameras=2.5).__post_init__, "source cameras, at least 1, got 2.5"),
-        (forged(StreamConfig(), background="grey").__post_init__, "background 'black' or 'white', got 'grey'"),
+        (
+            forged(StreamConfig(), background="grey").__post_init__,
+            "background 'black' or 'white', got 'grey'",
+        ),
         (lambda: StreamConfig(memory_mb=-5.0), "memory_mb of 0 or more, or None for no limit, got -5.0"),
         (
             lambda: unwrap(Stream.__init__)(object.__new__(Stream), "views"),
@@ -459,15 +491,36 @@ class Wall:
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda depth: torch.where(depth > 0, depth, torch.inf), "expected finite numbers in {}, .*; use 0 where"),
-        (lambda depth: torch.where(depth > 0, depth, torch.nan), "expected finite numbers in {}, .*; use 0 where"),
+        (
+            lambda depth: torch.where(depth > 0, depth, torch.inf),
+            "expected finite numbers in {}, .*; use 0 where",
+        ),
+        (
+            lambda depth: torch.where(depth > 0, depth, torch.nan),
+            "expected finite numbers in {}, .*; use 0 where",
+        ),
         (lambda depth: depth - 1, r"expected {} in \[0, inf\], got values from -1 to .*; use 0 where"),
-        (lambda depth: (1000 * depth).int(), r"expected {} as torch.float32, got torch.int32; .*\(\), in metres"),
-        (lambda depth: depth.half(), r"expected {} as torch.float32, got torch.float16; convert it with \.float\(\)"),
-        (lambda depth: depth[:, :40], r"expected {} of shape \(2, 48, 48\) or larger images, got \(2, 40, 48\)"),
-        (lambda depth: depth[:, None], r"expected {} of shape .*, got \(2, 1, 48, 48\); give one image per camera"),
+        (
+            lambda depth: (1000 * depth).int(),
+            r"expected {} as torch.float32, got torch.int32; .*\(\), in metres",
+        ),
+        (
+            lambda depth: depth.half(),
+            r"expected {} as torch.float32, got torch.float16; convert it with \.float\(\)",
+        ),
+        (
+            lambda depth: depth[:, :40],
+            r"expected {} of shape \(2, 48, 48\) or larger images, got \(2, 40, 48\)",
+        ),
+        (
+            lambda depth: depth[:, None],
+            r"expected {} of shape .*, got \(2, 1, 48, 48\); give one image per camera",
+        ),
         (lambda depth: depth[:1], r"expected {} of shape .*, got \(1, 48, 48\); give one image per camera"),
-        (lambda depth: depth.numpy(), "expected {} as a tensor, got ndarray; convert it with torch.as_tensor"),
+        (
+            lambda depth: depth.numpy(),
+            "expected {} as a tensor, got ndarray; convert it with torch.as_tensor",
+        ),
     ],
 )
 def test_a_wrong_depth_of_a_provider_is_refused(change, message):
@@ -484,10 +537,14 @@ def test_a_providers_images_may_be_padded():
     assert torch.equal(cached.depth(("c4",)), photograph(SPARSE).depth[3:4])
 
 
-@pytest.mark.parametrize("geometry", [photograph(SPARSE).depth, lambda cameras: None, Wall, photograph(SPARSE)])
+@pytest.mark.parametrize(
+    "geometry", [photograph(SPARSE).depth, lambda cameras: None, Wall, photograph(SPARSE)]
+)
 def test_a_geometry_that_provides_no_depth_is_refused(geometry):
     add_frame = unwrap(Stream.add_frame)  # without the checks of types
-    with pytest.raises(ValueError, match=r"expected a geometry with a method depth\(cameras\), got .*; pass an object"):
+    with pytest.raises(
+        ValueError, match=r"expected a geometry with a method depth\(cameras\), got .*; pass an object"
+    ):
         add_frame(Stream(Telea(), CONFIG), photograph(SPARSE), geometry)
 
 
@@ -515,7 +572,9 @@ def test_a_frame_that_is_cached_takes_over_what_it_lacks(model):
     own.depth(["c0"])
     cached.depth(["c0", "c1"])
     before = own.depths["c0"]
-    assert second.adopt(cached) is own and own.depths["c0"] is before and own.depths["c1"] is cached.depths["c1"]
+    assert (
+        second.adopt(cached) is own and own.depths["c0"] is before and own.depths["c1"] is cached.depths["c1"]
+    )
 
 
 def test_models_of_different_weights_share_a_memory(model):

@@ -32,7 +32,9 @@ def test_a_selection_refers_to_the_images_and_is_stacked_once(frame):
     assert torch.equal(chosen.depth, frame.depth[[2, 0], :50, :60])
     for field in ("rgb", "mask"):
         images = getattr(frame, field)
-        assert [part.data_ptr() for part in chosen.per_camera(field)] == [images[n].data_ptr() for n in (2, 0)]
+        assert [part.data_ptr() for part in chosen.per_camera(field)] == [
+            images[n].data_ptr() for n in (2, 0)
+        ]
         stack = getattr(chosen, field)
         assert torch.equal(stack, images[[2, 0], ..., :50, :60]) and getattr(chosen, field) is stack
     assert replace(chosen, time=7).rgb is chosen.rgb
@@ -72,22 +74,49 @@ def of_cameras(**fields):
 @pytest.mark.parametrize(
     "frame, message",
     [
-        (forged(RIG, rgb=RIG.rgb / 255), r"expected rgb as torch.uint8, got torch.float32; scale it to 0 to 255"),
+        (
+            forged(RIG, rgb=RIG.rgb / 255),
+            r"expected rgb as torch.uint8, got torch.float32; scale it to 0 to 255",
+        ),
         (
             forged(RIG, rgb=RIG.rgb.movedim(1, -1)),
             r"rgb of shape \(3, 3, 16, 16\).*got \(3, 16, 16, 3\).*channels first",
         ),
-        (forged(RIG, rgb=RIG.rgb[:2]), r"expected rgb of shape \(3, 3, 16, 16\).*got \(2, 3, 16, 16\); give one image"),
-        (forged(RIG, rgb=RIG.rgb[..., :9]), r"rgb of shape \(3, 3, 16, 16\).*got \(3, 3, 16, 9\); .* size_px"),
-        (forged(RIG, rgb=RIG.rgb.numpy()), "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor"),
-        (forged(RIG, mask=RIG.mask > 0), "expected mask as torch.uint8, got torch.bool; scale it to 0 to 255"),
-        (forged(RIG, mask=RIG.mask / 255), "expected mask as torch.uint8, got torch.float32; scale it to 0 to 255"),
+        (
+            forged(RIG, rgb=RIG.rgb[:2]),
+            r"expected rgb of shape \(3, 3, 16, 16\).*got \(2, 3, 16, 16\); give one image",
+        ),
+        (
+            forged(RIG, rgb=RIG.rgb[..., :9]),
+            r"rgb of shape \(3, 3, 16, 16\).*got \(3, 3, 16, 9\); .* size_px",
+        ),
+        (
+            forged(RIG, rgb=RIG.rgb.numpy()),
+            "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor",
+        ),
+        (
+            forged(RIG, mask=RIG.mask > 0),
+            "expected mask as torch.uint8, got torch.bool; scale it to 0 to 255",
+        ),
+        (
+            forged(RIG, mask=RIG.mask / 255),
+            "expected mask as torch.uint8, got torch.float32; scale it to 0 to 255",
+        ),
         (forged(RIG, mask=RIG.mask // 255), "expected masks of 0 to 255, got masks of 0 and 1; multiply"),
-        (forged(RIG, mask=RIG.mask[:, :9]), r"mask of shape \(3, 16, 16\).*got \(3, 9, 16\); give one mask per camera"),
-        (of_cameras(names=("a", "b", "a")), r"expected a different name for each camera, got .*\['a'\]; rename"),
+        (
+            forged(RIG, mask=RIG.mask[:, :9]),
+            r"mask of shape \(3, 16, 16\).*got \(3, 9, 16\); give one mask per camera",
+        ),
+        (
+            of_cameras(names=("a", "b", "a")),
+            r"expected a different name for each camera, got .*\['a'\]; rename",
+        ),
         (of_cameras(names=("a", "b")), r"expected K of shape \(2, 3, 3\), got \(3, 3, 3\); give one"),
         (of_cameras(K=CAMERAS.K.double()), r"expected K as torch.float32, got torch.float64; .*\.float\(\)"),
-        (of_cameras(camera_from_world=CAMERAS.camera_from_world[:, :3]), r"\(3, 4, 4\), got \(3, 3, 4\); .* 0 0 0 1"),
+        (
+            of_cameras(camera_from_world=CAMERAS.camera_from_world[:, :3]),
+            r"\(3, 4, 4\), got \(3, 3, 4\); .* 0 0 0 1",
+        ),
         (
             of_cameras(size_px=CAMERAS.size_px.float()),
             r"expected size_px as torch.int64 .*got torch.float32; .*\.long\(\)",
@@ -111,7 +140,12 @@ def test_right_frames_pass(frame):
     some = frame.without(frame.cameras.names[1:2])
     noise = torch.zeros_like(frame.mask)
     noise[0, 0, :2] = 1
-    for right in (frame, padded, some, *(replace(frame, mask=mask) for mask in (None, 0 * frame.mask, noise))):
+    for right in (
+        frame,
+        padded,
+        some,
+        *(replace(frame, mask=mask) for mask in (None, 0 * frame.mask, noise)),
+    ):
         right.check()
     Silhouettes(padded.mask, frame.cameras).check()
 
@@ -122,7 +156,9 @@ TARGET = camera_at(100, "t", 16)
 CLOSE = ("c1", "c0")
 SEEN = photograph(TARGET)
 ALPHA = SEEN.mask[0] / 255
-VIEW = IncompleteView(TARGET, SEEN.rgb[0] / 255, ALPHA, 0 * ALPHA, SEEN.depth[0], CLOSE, ALPHA.expand(2, 16, 16) / 2, 0)
+VIEW = IncompleteView(
+    TARGET, SEEN.rgb[0] / 255, ALPHA, 0 * ALPHA, SEEN.depth[0], CLOSE, ALPHA.expand(2, 16, 16) / 2, 0
+)
 FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
 
 
@@ -134,18 +170,30 @@ FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
             "expected rgb in \\[0, 1\\], got values from 0 to .*; divide 8-bit images by 255",
         ),
         (forged(VIEW, rgb=VIEW.rgb - 1), "expected rgb in \\[0, 1\\], got values from -1 to .*clamp"),
-        (forged(VIEW, rgb=(VIEW.rgb * 255).byte()), f"expected rgb as torch.float32, got torch.uint8; {FLOAT}"),
+        (
+            forged(VIEW, rgb=(VIEW.rgb * 255).byte()),
+            f"expected rgb as torch.float32, got torch.uint8; {FLOAT}",
+        ),
         (forged(VIEW, rgb=VIEW.rgb.double()), f"expected rgb as torch.float32, got torch.float64; {FLOAT}"),
-        (forged(VIEW, mask=VIEW.mask.bfloat16()), f"expected mask as torch.float32, got torch.bfloat16; {FLOAT}"),
+        (
+            forged(VIEW, mask=VIEW.mask.bfloat16()),
+            f"expected mask as torch.float32, got torch.bfloat16; {FLOAT}",
+        ),
         (forged(VIEW, error=VIEW.error > 0), f"expected error as torch.float32, got torch.bool; {FLOAT}"),
         (forged(VIEW, error=VIEW.error + 255), "expected error in .*, got values from 255 to 255; divide"),
-        (forged(VIEW, rgb=VIEW.rgb.numpy()), "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor"),
+        (
+            forged(VIEW, rgb=VIEW.rgb.numpy()),
+            "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor",
+        ),
         (forged(VIEW, depth=None), "expected depth as a tensor, got NoneType"),
         (
             forged(VIEW, rgb=VIEW.rgb.movedim(0, -1)),
             r"rgb of shape \(3, 16, 16\), got \(16, 16, 3\); .* channels first",
         ),
-        (forged(VIEW, depth=VIEW.depth[:9]), r"depth of shape \(16, 16\), got \(9, 16\); .* the view's camera"),
+        (
+            forged(VIEW, depth=VIEW.depth[:9]),
+            r"depth of shape \(16, 16\), got \(9, 16\); .* the view's camera",
+        ),
         (
             forged(VIEW, camera=TARGET.resized(20, 20)),
             r"rgb of shape \(3, 20, 20\), got \(3, 16, 16\); .* the view's camera",
@@ -155,9 +203,18 @@ FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
             forged(VIEW, source_views=("c1",)),
             r"weights of shape \(1, 16, 16\), got \(2, 16, 16\); .* each of source_views",
         ),
-        (forged(VIEW, source_views=(), weights=VIEW.weights[:0]), "expected source_views with a camera, got none"),
-        (forged(VIEW, weights=VIEW.weights / 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
-        (forged(VIEW, weights=VIEW.weights * 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
+        (
+            forged(VIEW, source_views=(), weights=VIEW.weights[:0]),
+            "expected source_views with a camera, got none",
+        ),
+        (
+            forged(VIEW, weights=VIEW.weights / 2),
+            "expected weights that sum to 1 or 0 .*; divide them by their sum",
+        ),
+        (
+            forged(VIEW, weights=VIEW.weights * 2),
+            "expected weights that sum to 1 or 0 .*; divide them by their sum",
+        ),
         (
             forged(VIEW, depth=1 / VIEW.mask),
             "expected finite numbers in depth, got NaN or infinity; use 0 where there is no",
@@ -166,7 +223,10 @@ FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
             forged(VIEW, depth=VIEW.depth * math.nan),
             "expected finite numbers in depth, got NaN or infinity; use 0 where",
         ),
-        (forged(VIEW, depth=VIEW.depth - 1), r"expected depth in \[0, inf\], got values from -1 to .*; use 0 where"),
+        (
+            forged(VIEW, depth=VIEW.depth - 1),
+            r"expected depth in \[0, inf\], got values from -1 to .*; use 0 where",
+        ),
         (forged(VIEW, fade=VIEW.mask * 2), "expected fade in .*, got values from 0 to 2"),
         (
             forged(VIEW, target_mask=VIEW.mask.double()),
@@ -187,5 +247,7 @@ def test_views_of_wrong_types_sizes_or_ranges_are_refused(view, message):
 
 
 def test_a_view_may_leave_its_range_by_rounding():
-    view = replace(VIEW, rgb=VIEW.rgb * 1.001 - 0.001, weights=VIEW.weights.half().float() * 1.001, fade=VIEW.error)
+    view = replace(
+        VIEW, rgb=VIEW.rgb * 1.001 - 0.001, weights=VIEW.weights.half().float() * 1.001, fade=VIEW.error
+    )
     replace(view, target_mask=VIEW.mask, silhouettes=Silhouettes(RIG.mask, CAMERAS)).check(CAMERAS.names)

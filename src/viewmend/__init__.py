@@ -111,7 +111,9 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 def __getattr__(name: str) -> object:
     """Import a public name on first use."""
     if name not in _MODULES:
-        raise AttributeError(f"module 'viewmend' has no attribute '{name}'; viewmend.__all__ lists those that it has")
+        raise AttributeError(
+            f"module 'viewmend' has no attribute '{name}'; viewmend.__all__ lists those that it has"
+        )
     return getattr(import_module(f"viewmend.{_MODULES[name]}"), name)
 
 

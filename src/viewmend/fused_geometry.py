@@ -40,7 +40,9 @@ def fuse_geometry(
     if not len(hull.mesh.vertices):
         return hull
     on_host = cached.frame.cameras.on_host
-    views = surround(on_host, hull.bounds.on_host.center, config.max_views, math.radians(config.min_angle_deg))
+    views = surround(
+        on_host, hull.bounds.on_host.center, config.max_views, math.radians(config.min_angle_deg)
+    )
     predicted = []
     for number in range(len(views)):
         camera = _resized(views[number], hull.bounds, config.view_px).to(cached.frame.rgb.device)

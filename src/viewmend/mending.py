@@ -9,7 +9,14 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.evaluation.scores import Scorers, ViewScores, load_scorers, mean_over_frames, score_view, true_view
+from viewmend.evaluation.scores import (
+    Scorers,
+    ViewScores,
+    load_scorers,
+    mean_over_frames,
+    score_view,
+    true_view,
+)
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
@@ -199,4 +206,6 @@ def _input_iou(cached: CachedFrame) -> dict[str, float]:
     frame = cached.frame
     assert frame.mask is not None, "frames without masks are refused"
     iou = silhouette_iou(cached.depth(frame.cameras.names) > 0, frame.mask).tolist()
-    return {name: score for name, score in zip(frame.cameras.names, iou, strict=True) if not math.isnan(score)}
+    return {
+        name: score for name, score in zip(frame.cameras.names, iou, strict=True) if not math.isnan(score)
+    }

@@ -28,7 +28,14 @@ from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes, check_target_mask
+from viewmend.types import (
+    CompletedView,
+    ContextViews,
+    IncompleteView,
+    MultiViewFrame,
+    Silhouettes,
+    check_target_mask,
+)
 from viewmend.utils.cancellation import stop_if_cancelled
 from viewmend.utils.tensors import to_mmap
 from viewmend.utils.timing import StageTimes, ms_since, now_s
@@ -144,7 +151,9 @@ class Stream:
         self.bounds = bounds
         self.error_model = error_model
         self._depth_model = inpainter if inpainter.predicts_depth else error_model
-        if self.config.geometry == "fused" and (self._depth_model is None or not self._depth_model.predicts_depth):
+        if self.config.geometry == "fused" and (
+            self._depth_model is None or not self._depth_model.predicts_depth
+        ):
             raise ValueError(
                 f"expected a model that predicts depth for the geometry 'fused', got {type(inpainter).__name__} alone; "
                 "give one: Stream(..., error_model=load_inpainter('views')), or use the geometry 'hull'"
@@ -262,7 +271,9 @@ class Stream:
             ValueError: it is not cached.
         """
         if not self._frames or (time is not None and time not in self._frames):
-            raise ValueError(f"expected the time of a cached frame, {self.times}, got {time}; add its frame first")
+            raise ValueError(
+                f"expected the time of a cached frame, {self.times}, got {time}; add its frame first"
+            )
         return self._frames[max(self._frames) if time is None else time]
 
     def render(
@@ -375,14 +386,18 @@ class Stream:
         cached = self.cached_frame(time)
         if not isinstance(cached.proxy, GeometryProxy):
             got = type(cached.proxy).__name__
-            raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself, and use mend")
+            raise ValueError(
+                f"expected a GeometryProxy to render, got {got}; render the view yourself, and use mend"
+            )
         margin_px = self.inpainter.crop_margin_px(quality)
         if margin_px is None:
             crop = mesh_crop(cached.proxy.mesh.vertices, target, BORDER_PX, 1)
         else:
             crop = mesh_crop(cached.proxy.mesh.vertices, target, margin_px, grid_px(margin_px))
         camera = crop.of_camera(target)
-        part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, cached.depth)
+        part, evidence = render_view(
+            cached.frame, cached.proxy, camera, self.config.render, exclude, cached.depth
+        )
         if target_mask is not None:
             part = replace(part, target_mask=crop.of_image(target_mask).clamp(0, 1))
         return part, evidence, crop
@@ -396,7 +411,9 @@ class Stream:
         """
         fraction = self._refine_fraction(quality, by_rule=evidence is not None)
         context = self.context_provider(RenderQuality(refine_fraction=fraction), exclude)
-        masked = decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
+        masked = decide_error_mask(
+            view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model
+        )
         return masked, context.encoding_ms
 
     def _refine_fraction(self, quality: RenderQuality, by_rule: bool) -> float | None:
@@ -455,7 +472,9 @@ class Stream:
         times = StageTimes(geometry=cached.pop_geometry_ms(), context=encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, state, times)
 
-    def context_provider(self, quality: RenderQuality | None = None, exclude: Sequence[str] = ()) -> ContextProvider:
+    def context_provider(
+        self, quality: RenderQuality | None = None, exclude: Sequence[str] = ()
+    ) -> ContextProvider:
         """The cameras of all frames in memory, except `exclude`, and what was computed from them."""
         return ContextProvider(self._context, quality, exclude, self._memory)
 

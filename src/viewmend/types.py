@@ -167,7 +167,9 @@ class ContextViews(_LazyStacks, OnDevice):
     """z-depth of G[t] in each camera, metres; 0 where the camera does not see the proxy."""
 
     @classmethod
-    def of_depths(cls, frame: MultiViewFrame, depths: Sequence[Float[Tensor, "_height _width"]]) -> "ContextViews":
+    def of_depths(
+        cls, frame: MultiViewFrame, depths: Sequence[Float[Tensor, "_height _width"]]
+    ) -> "ContextViews":
         """A frame with one depth image per camera, at least as large as the frame's images, without copying."""
         height, width = frame.per_camera("rgb")[0].shape[1:]
         return cls._of_parts({"depth": [depth[:height, :width] for depth in depths]}, frame=frame)
@@ -315,7 +317,9 @@ class IncompleteView:
                 "candidate_views"
             )
         if not self.source_views:
-            raise ValueError("expected source_views with a camera, got none; name those that coloured the view")
+            raise ValueError(
+                "expected source_views with a camera, got none; name those that coloured the view"
+            )
         self.camera.check_single()
         width, height = self.camera.max_size_px
         check_target_mask(self.target_mask, (height, width))
@@ -342,7 +346,9 @@ class IncompleteView:
             what = "one image for each of source_views" if name == "weights" else "it channels first"
             arrange = f"give {what}, at the size of the view's camera"
             value = getattr(self, name)
-            images[name] = check_tensor(name, value, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
+            images[name] = check_tensor(
+                name, value, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange
+            )
 
         # ranges
         sums = self.weights.sum(0)
@@ -351,15 +357,21 @@ class IncompleteView:
         for name, (smallest, largest) in zip(images, ranges, strict=True):
             check_range(name, smallest, largest, most=math.inf if name == "depth" else 1.0)
         if low < -SUM_TOLERANCE or high > SUM_TOLERANCE:
-            raise ValueError("expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum")
+            raise ValueError(
+                "expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum"
+            )
 
 
 def check_range(name: str, low: float, high: float, most: float = 1.0) -> None:
     """ValueError unless an image's smallest and largest value are finite and in [0, most], up to a tolerance."""
     if not math.isfinite(low + high):
-        raise ValueError(f"expected finite numbers in {name}, got NaN or infinity; use 0 where there is no surface")
+        raise ValueError(
+            f"expected finite numbers in {name}, got NaN or infinity; use 0 where there is no surface"
+        )
     if low < -OVERSHOOT or high > most + OVERSHOOT:
-        how = "divide 8-bit images by 255, and clamp others" if most == 1 else "use 0 where there is no surface"
+        how = (
+            "divide 8-bit images by 255, and clamp others" if most == 1 else "use 0 where there is no surface"
+        )
         raise ValueError(f"expected {name} in [0, {most:g}], got values from {low:.3g} to {high:.3g}; {how}")
 
 

@@ -55,7 +55,9 @@ class ViewSequence:
         self._warm_up: Stream | None = None
 
     @exact_times()
-    def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
+    def add_frame(
+        self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None
+    ) -> CachedFrame:
         """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
         own = self.stream
@@ -98,11 +100,15 @@ class ViewSequence:
         self.state = made.viewer
         return made
 
-    def skip(self, target: Cameras, time: int, target_mask: Float[Tensor, "height width"] | None = None) -> None:
+    def skip(
+        self, target: Cameras, time: int, target_mask: Float[Tensor, "height width"] | None = None
+    ) -> None:
         """Advance the state past a frame whose view is not needed."""
         if type(self.stream.viewer()) is State:
             return  # nothing is carried from view to view
         state = self.stream.advance(self.stream.render(target, time, self._exclude, target_mask), self.state)
         if state is None:
-            state = self.stream.view(target, self.state, time, self._quality, self._exclude, target_mask).viewer
+            state = self.stream.view(
+                target, self.state, time, self._quality, self._exclude, target_mask
+            ).viewer
         self.state = state

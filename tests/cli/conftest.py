@@ -14,7 +14,10 @@ from viewmend.geometry.cameras import concatenate_cameras
 
 def rig():
     """Six cameras about the ball at different heights, and `held` between two of them."""
-    around = [camera_at(60 * n, f"c{n}", height_m=height) for n, height in enumerate((0.0, 1.2, -0.8, 0.6, 1.4, -1.0))]
+    around = [
+        camera_at(60 * n, f"c{n}", height_m=height)
+        for n, height in enumerate((0.0, 1.2, -0.8, 0.6, 1.4, -1.0))
+    ]
     return concatenate_cameras([*around, camera_at(75, "held", height_m=0.3)])
 
 

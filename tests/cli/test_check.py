@@ -29,7 +29,13 @@ def test_real_capture_in_figures_and_in_words(shared, capsys, tmp_path):
     assert 1 < max(capture["subject_extent_m"]) < 2.2
     assert cv2.imread(str(tmp_path / "check.jpg")).shape[1] > 3 * 400
     words = "\n".join(_capture_as_text(capture))
-    for word in ("utrecht: a capture with 4 cameras", "644 x 486", "'000' to '425', 50 fps", "0.001 m", "hull IoU"):
+    for word in (
+        "utrecht: a capture with 4 cameras",
+        "644 x 486",
+        "'000' to '425', 50 fps",
+        "0.001 m",
+        "hull IoU",
+    ):
         assert word in words
 
 
@@ -59,9 +65,26 @@ COMMANDS = {
     "evaluate": lambda model, capture, out: [
         *("evaluate", "P", "--scenes", "1", "--out", out, "--methods", model, "--error-rule", "all", *SMALL)
     ],
-    "export-scene": lambda model, capture, out: ["export-scene", capture, out, "--model", model, "--views", "8"],
+    "export-scene": lambda model, capture, out: [
+        "export-scene",
+        capture,
+        out,
+        "--model",
+        model,
+        "--views",
+        "8",
+    ],
     "serve": lambda model, capture, out: ["serve", "--port", "0", "--model", model],
-    "train": lambda model, capture, out: ["train", "finetune", "--captures", capture, "--from", model, "--out", out],
+    "train": lambda model, capture, out: [
+        "train",
+        "finetune",
+        "--captures",
+        capture,
+        "--from",
+        model,
+        "--out",
+        out,
+    ],
 }
 
 

@@ -34,7 +34,9 @@ def test_every_frame_is_judged_by_the_truth_of_its_time_and_place(tmp_path, monk
     mend = Mender.mend
 
     def watched(self, frame, target, truth):
-        seen.append((frame.time, truth.time, torch.equal(target.camera_from_world, truth.cameras.camera_from_world)))
+        seen.append(
+            (frame.time, truth.time, torch.equal(target.camera_from_world, truth.cameras.camera_from_world))
+        )
         return mend(self, frame, target, truth)
 
     monkeypatch.setattr(Mender, "mend", watched)

@@ -32,7 +32,10 @@ def test_a_report_is_written_in_every_format_and_repeated_exactly(tmp_path, caps
 def test_every_n_th_scene_covers_all_kinds(tmp_path):
     found = scenes_of("P", RunOptions(out=tmp_path, every=5, frames=1, size=64))
     assert len({(scene.rig, scene.style) for scene in found}) == len(found) == 6
-    assert [s.name for s in scenes_of("P", RunOptions(out=tmp_path, every=5, scenes=2))] == ["P-10000", "P-10005"]
+    assert [s.name for s in scenes_of("P", RunOptions(out=tmp_path, every=5, scenes=2))] == [
+        "P-10000",
+        "P-10005",
+    ]
 
 
 @pytest.mark.parametrize("every", [1, 2, 3, 4, 6, 9, 10])
@@ -54,7 +57,13 @@ def test_out_must_not_be_a_file(tmp_path, capsys):
 def test_weights_lists_known_files_and_searched_folders(tmp_path, monkeypatch, capsys):
     assert cli.main(["weights"]) == 0
     out = capsys.readouterr().out
-    said = ("lpips-alex: verified", "i3d: missing", "dstt: missing", "weights get i3d", str(tmp_path / "nowhere"))
+    said = (
+        "lpips-alex: verified",
+        "i3d: missing",
+        "dstt: missing",
+        "weights get i3d",
+        str(tmp_path / "nowhere"),
+    )
     assert [word for word in said if word not in out] == []
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     (tmp_path / "DSTT.pth").touch()
@@ -62,7 +71,9 @@ def test_weights_lists_known_files_and_searched_folders(tmp_path, monkeypatch, c
     assert cli.main(["weights", "--json"]) == 1
     found = {line["name"]: line for line in json.loads(capsys.readouterr().out)}
     assert found["dstt"]["status"].startswith("found") and found["dstt"]["path"] == str(tmp_path / "DSTT.pth")
-    assert found["i3d"]["status"] == "wrong" and hashlib.sha256(b"another").hexdigest() in found["i3d"]["error"]
+    assert (
+        found["i3d"]["status"] == "wrong" and hashlib.sha256(b"another").hexdigest() in found["i3d"]["error"]
+    )
     assert found["lpips-vgg"]["status"] == "missing"
 
 
@@ -89,6 +100,14 @@ def test_mend_and_evaluate_agree(folder, tmp_path, mend, capsys, model):
     assert cli.main([*command, "--methods", model, "--json"]) == 0
     cell = json.loads(capsys.readouterr().out)["cells"][1]
     names = {"psnr_whole_rendered": "psnr_rendered_whole", "alpha_iou": "alpha_iou_whole"}
-    keys = ["psnr_whole", "psnr_whole_rendered", "ssim_whole", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes"]
+    keys = [
+        "psnr_whole",
+        "psnr_whole_rendered",
+        "ssim_whole",
+        "psnr_subject",
+        "alpha_iou",
+        "psnr_valid",
+        "psnr_holes",
+    ]
     for key in [*keys, "psnr_holes_fg"]:
         assert cell[names.get(key, key)] == pytest.approx(mended[key], abs=1e-6), key

@@ -123,7 +123,9 @@ def test_pictures_and_depth_fit_each_other(scene):
         depth = file.channels()["Z"].pixels
     assert rgba.shape == (64, 64, 4) and depth.dtype == np.float32
     assert ((rgba[..., 3] > 127) == (depth > 0)).all() and (depth > 0).mean() > 0.1
-    assert depth[depth > 0].min() == pytest.approx(float(rig().centers.norm(dim=-1).mean()) - RADIUS_M, abs=0.05)
+    assert depth[depth > 0].min() == pytest.approx(
+        float(rig().centers.norm(dim=-1).mean()) - RADIUS_M, abs=0.05
+    )
     assert len(np.unique(depth)) > 200  # not rounded
 
 
@@ -170,6 +172,11 @@ def test_a_missing_compiler_is_said(tmp_path, capsys, monkeypatch):
 
 def test_a_missing_extra_is_said(tmp_path, capsys, monkeypatch):
     there = importlib.util.find_spec
-    monkeypatch.setattr("viewmend.export.model.find_spec", lambda name: None if name == "onnxscript" else there(name))
+    monkeypatch.setattr(
+        "viewmend.export.model.find_spec", lambda name: None if name == "onnxscript" else there(name)
+    )
     assert main(["export", "views", "--format", "onnx", "--out", str(tmp_path / "m.onnx")]) == 2
-    assert "expected onnxscript for --format onnx, got none; pip install 'viewmend[all]'" in capsys.readouterr().err
+    assert (
+        "expected onnxscript for --format onnx, got none; pip install 'viewmend[all]'"
+        in capsys.readouterr().err
+    )

@@ -14,7 +14,9 @@ ROOT = Path(__file__).resolve().parents[2]
 WITH_RECIPES = ("train", "make-dataset")
 NEGATIVE = ("do not ", "disable ", "skip ", "leave ", "ignore ", "never ", "without ")
 UNCHANGED = re.compile(r"(use|take|keep|show|write) .*\bas (it is|they are)\b")
-CASES = [c.name for c in COMMANDS if c.name not in WITH_RECIPES] + [f"{c} {r}" for c in WITH_RECIPES for r in RECIPES]
+CASES = [c.name for c in COMMANDS if c.name not in WITH_RECIPES] + [
+    f"{c} {r}" for c in WITH_RECIPES for r in RECIPES
+]
 
 
 @cache
@@ -42,9 +44,13 @@ def options_of(command: str) -> dict[str, str]:
 @pytest.mark.parametrize("command", CASES)
 def test_a_negative_flag_is_described_as_typed(command):
     flags = {name: text for name, text in options_of(command).items() if re.match(r"--([\w-]+\.)?no-", name)}
-    wrong = {n: t for n, t in flags.items() if not (t.lower().startswith(NEGATIVE) or UNCHANGED.match(t.lower()))}
+    wrong = {
+        n: t for n, t in flags.items() if not (t.lower().startswith(NEGATIVE) or UNCHANGED.match(t.lower()))
+    }
     assert wrong == {}, "begin with a verb that says what the flag switches off"
-    assert {n: t for n, t in flags.items() if "default: True" in t} == {}, "a flag that is not given is not the default"
+    assert {n: t for n, t in flags.items() if "default: True" in t} == {}, (
+        "a flag that is not given is not the default"
+    )
 
 
 @pytest.mark.parametrize("command", [case for case in CASES if case.split()[0] in WITH_RECIPES])
@@ -58,7 +64,9 @@ def test_every_field_of_a_config_is_read():
         for folder in ("src/viewmend/training", "src/viewmend/models", "src/viewmend/contrib/baselines")
         for path in (ROOT / folder).rglob("*.py")
     )
-    source += "\n".join((ROOT / f"src/viewmend/cli/{name}.py").read_text() for name in ("train", "make_dataset"))
+    source += "\n".join(
+        (ROOT / f"src/viewmend/cli/{name}.py").read_text() for name in ("train", "make_dataset")
+    )
 
     def configs(value):
         yield type(value)
@@ -68,7 +76,12 @@ def test_every_field_of_a_config_is_read():
                 yield from configs(inner)
 
     kinds = {kind for name in RECIPES for kind in configs(make_recipe(name))}
-    assert {kind.__name__ for kind in kinds} >= {"TrainConfig", "SceneConfig", "SamplingConfig", "ViewsLossWeights"}
+    assert {kind.__name__ for kind in kinds} >= {
+        "TrainConfig",
+        "SceneConfig",
+        "SamplingConfig",
+        "ViewsLossWeights",
+    }
     unused = [
         f"{kind.__name__}.{field.name}"
         for kind in kinds
@@ -85,7 +98,9 @@ CARDS = sorted((ROOT / "src/viewmend/weights").glob("*/README.md"))
 def test_model_cards_name_commands_and_options_that_exist(card):
     """An option belongs to the last command before it."""
     command, wrong = None, []
-    for words, option in re.findall(r"`viewmend ([a-z-]+(?: [\w-]+)?)|(?<![\w-])(--[a-z][\w.-]*)", card.read_text()):
+    for words, option in re.findall(
+        r"`viewmend ([a-z-]+(?: [\w-]+)?)|(?<![\w-])(--[a-z][\w.-]*)", card.read_text()
+    ):
         if words:
             command = next((c for c in (words, words.split()[0]) if c in CASES), None)
             wrong += [] if command else [words]

@@ -27,7 +27,9 @@ def test_help_and_mistakes_import_nothing_heavy(arguments):
         "import sys; from viewmend.cli import main; code = main(sys.argv[1:]);"
         "heavy = {'torch', 'cv2', 'numba', 'skimage', 'av'} & set(sys.modules); print(code, heavy, file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=True
+    )
     assert done.stderr.splitlines()[-1] == f"{0 if '--help' in arguments else 2} set()"
 
 
@@ -38,12 +40,16 @@ def raising(error):
     return run
 
 
-@pytest.mark.parametrize("error", [ValueError("too\nbad"), FileNotFoundError(2, "no such", "f"), OSError("full")])
+@pytest.mark.parametrize(
+    "error", [ValueError("too\nbad"), FileNotFoundError(2, "no such", "f"), OSError("full")]
+)
 def test_what_a_user_can_get_wrong_is_one_line(monkeypatch, capsys, error):
     assert run_command(monkeypatch, raising(error)) == 2
     out, message = capsys.readouterr()
     assert out == "" and message.startswith(f"viewmend: error: {' '.join(str(error).split())}")
-    assert message.count("\n") == 1 and ("check the path" in message) == (getattr(error, "filename", None) == "f")
+    assert message.count("\n") == 1 and ("check the path" in message) == (
+        getattr(error, "filename", None) == "f"
+    )
 
 
 def test_our_own_mistakes_interruption_and_success(monkeypatch, capsys):
@@ -128,7 +134,11 @@ def test_one_request_ends_a_step_and_only_a_later_ctrl_c_everything(number, monk
         assert not stopped()
         os.kill(os.getpid(), number)
         assert stopped() == number and "saving a checkpoint" in capsys.readouterr().err
-        for again in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):  # torchrun and `timeout` signal several times
+        for again in (
+            signal.SIGINT,
+            signal.SIGTERM,
+            signal.SIGINT,
+        ):  # torchrun and `timeout` signal several times
             os.kill(os.getpid(), again)
         monkeypatch.setattr(console, "REPEATED_S", -1.0)
         os.kill(os.getpid(), signal.SIGTERM)
@@ -156,7 +166,9 @@ def test_sigterm_lets_a_command_clean_up(tmp_path):
         "    try:\n        print('begun', flush=True)\n        time.sleep(20)\n"
         "    finally:\n        pathlib.Path(sys.argv[1]).write_text('cleaned')\n"
     )
-    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "a")], stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path / "a")], stdout=subprocess.PIPE
+    ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"begun\n"
         process.terminate()
         assert process.wait(20) == 143

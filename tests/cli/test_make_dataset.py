@@ -17,7 +17,10 @@ def make(out, count, *more, recipe="views"):
 @pytest.mark.parametrize(("recipe", "kind", "views"), [("views", StoredScene, "1"), ("rays", RayBatch, "3")])
 def test_an_interrupted_data_set_is_completed_exactly(recipe, kind, views, tmp_path, monkeypatch, capsys):
     """Also from the middle of a scene."""
-    for module in ("viewmend.training.views.ViewsObjectiveConfig", "viewmend.training.rays.RaysObjectiveConfig"):
+    for module in (
+        "viewmend.training.views.ViewsObjectiveConfig",
+        "viewmend.training.rays.RaysObjectiveConfig",
+    ):
         monkeypatch.setattr(f"{module}.shard_size", 2)
     more = ("--num-holdout-views", views)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
@@ -25,7 +28,9 @@ def test_an_interrupted_data_set_is_completed_exactly(recipe, kind, views, tmp_p
     assert make(parts, 2, *more, recipe=recipe) == 0
     position = (parts / "next.json").read_text()
     assert make(parts, 4, *more, recipe=recipe) == 0
-    (parts / "next.json").write_text(position)  # killed after the second shard, before its position was recorded
+    (parts / "next.json").write_text(
+        position
+    )  # killed after the second shard, before its position was recorded
     assert make(parts, 4, *more, recipe=recipe) == 0
     names = ["next.json", "plan.txt", "shard-00000.tar", "shard-00001.tar"]
     assert sorted(path.name for path in parts.iterdir() if path.suffix) == names
@@ -36,7 +41,9 @@ def test_an_interrupted_data_set_is_completed_exactly(recipe, kind, views, tmp_p
     assert make(parts, 6, "--seed", "1", *more, recipe=recipe) == 2
     assert "the same options and seed" in capsys.readouterr().err
     (parts / "shard-00001.tar").unlink()
-    assert make(parts, 6, *more, recipe=recipe) == 2 and "expected 2 shards, found 1" in capsys.readouterr().err
+    assert (
+        make(parts, 6, *more, recipe=recipe) == 2 and "expected 2 shards, found 1" in capsys.readouterr().err
+    )
     (parts / "next.json").unlink()
     assert make(parts, 6, *more, recipe=recipe) == 2 and "without next.json" in capsys.readouterr().err
 

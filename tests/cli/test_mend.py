@@ -87,9 +87,9 @@ def test_the_whole_view_is_scored(folder, tmp_path, mend):
     prepared = prepare(open_masked(folder), [f"c{n}" for n in range(6)])
     truth = prepared.read(1).select(["held"])
     image, mask = truth.rgb[0] / 255 * (truth.mask[0] / 255), truth.mask[0] > 127
-    seen = torch.from_numpy(cv2.imread(str(tmp_path / "out" / "completed" / "000000.png"))[..., ::-1] / 255).movedim(
-        -1, 0
-    )
+    seen = torch.from_numpy(
+        cv2.imread(str(tmp_path / "out" / "completed" / "000000.png"))[..., ::-1] / 255
+    ).movedim(-1, 0)
     assert report["psnr_whole"] == pytest.approx(psnr(seen, image), abs=0.02)
     assert report["psnr_subject"] == pytest.approx(psnr(seen, image, mask), abs=0.02)
     assert report["ssim_whole"] == pytest.approx(float(ssim_map(seen, image).nanmean()), abs=1e-3)
@@ -120,7 +120,9 @@ def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, mend):
     assert np.abs(cut[(alpha > 0)[..., 0]][:, :3] - np.array(tells_all.COLOUR) * 255).max() < 10
     with av.open(str(tmp_path / "cutout.webm")) as film:
         decoder = av.CodecContext.create("libvpx-vp9", "r")
-        frames = [f.to_ndarray(format="rgba") for p in film.demux(film.streams.video[0]) for f in decoder.decode(p)]
+        frames = [
+            f.to_ndarray(format="rgba") for p in film.demux(film.streams.video[0]) for f in decoder.decode(p)
+        ]
     assert len(frames) == 2 and np.abs(frames[1][..., 3] - cut[1, ..., 3]).mean() < 4
 
 
@@ -128,7 +130,9 @@ def test_depth_is_written_in_millimetres(folder, tmp_path, mend):
     given = ["--leave-out", "held", "--depth", "--frames", "1:2"]
     for out, model in (("proxy", "telea"), ("own", TELLS_ALL)):
         mend(folder, tmp_path / out, *given, "--model", model)
-    proxy, own = (pictures(tmp_path / out / "depth", cv2.IMREAD_UNCHANGED)[0].astype(int) for out in ("proxy", "own"))
+    proxy, own = (
+        pictures(tmp_path / out / "depth", cv2.IMREAD_UNCHANGED)[0].astype(int) for out in ("proxy", "own")
+    )
     assert proxy.dtype == int and 1000 < proxy.max() < 9000 and proxy[0, 0] == own[0, 0] == 0
     assert np.abs(proxy - own - 100)[proxy > 0].max() <= 1  # what the model tells, a hand nearer
 
@@ -190,7 +194,9 @@ def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):
     camera = prepared.cameras[0]
     file = tmp_path / "path.json"
     pose = camera.world_from_camera[0].tolist()
-    file.write_text(json.dumps({"world_from_camera": [pose], "K": camera.K[0].tolist(), "width": 48, "height": 48}))
+    file.write_text(
+        json.dumps({"world_from_camera": [pose], "K": camera.K[0].tolist(), "width": 48, "height": 48})
+    )
     assert mend(shifted, tmp_path / "out", "--path", file, "--frames", "0:1")[0] == 0
     source = serve.open_source(serve.Options(source=str(shifted)))
     source.start()

@@ -26,7 +26,10 @@ POSES = [torch.eye(4).tolist()]
         (json.dumps({"world_from_camera": POSES, "width": 30}), "'height'"),
         (json.dumps(POSES * 3), "one per frame (2 frames), got 3"),
         (json.dumps({"world_from_camera": POSES, "K": [[0] * 3] * 3}), "expected 'K' as"),
-        (json.dumps({"world_from_camera": POSES, "width": 10**8, "height": 9}), "expected a whole number <= 16384"),
+        (
+            json.dumps({"world_from_camera": POSES, "width": 10**8, "height": 9}),
+            "expected a whole number <= 16384",
+        ),
         ("[" * 100_000, "expected JSON"),
     ],
 )

@@ -7,7 +7,9 @@ from viewmend.cli import main
 BRIEF = "--steps 2 --batch 2 --workers 0 --validate-every 0"
 HELD = "mend {ball} --out out --model telea --leave-out held"
 MISTAKES = {
-    "check": {"nothing": "expected a capture folder with nothing/cameras.json, but there is no such folder; check the"},
+    "check": {
+        "nothing": "expected a capture folder with nothing/cameras.json, but there is no such folder; check the"
+    },
     "check {ball}": {"--out check.txt": "the file name of an image"},
     "demo --out out": {"--frames 0": "--frames of at least 1, got 0"},
     "studio out": {
@@ -100,7 +102,9 @@ MISTAKES = {
 }
 
 
-CASES = [(f"{command} {options}", said) for command, wrong in MISTAKES.items() for options, said in wrong.items()]
+CASES = [
+    (f"{command} {options}", said) for command, wrong in MISTAKES.items() for options, said in wrong.items()
+]
 
 
 @pytest.mark.parametrize(("command", "message"), CASES)

@@ -97,8 +97,13 @@ def test_sigterm_to_the_process_group_ends_a_run_with_a_checkpoint(models, tmp_p
     capture = tmp_path / "mine"
     write_capture(Studio(StudioConfig(seed=3, cameras=5, frames=1, size_px=96)), capture)
     command[command.index("none")] = str(capture)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src"), "JAXTYPING_DISABLE": "1"}
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[2] / "src"),
+        "JAXTYPING_DISABLE": "1",
+    }
+    process = subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     assert process.stderr is not None
     printed = []
     while not (out / "log.jsonl").exists() or not (out / "log.jsonl").read_text():

@@ -135,7 +135,9 @@ def has_late_constants(tree: ast.Module) -> bool:
 def count_statements(function: Function) -> int:
     """Count the statements of a function, at all levels, without docstrings."""
     statements = [node for part in function.body for node in ast.walk(part) if isinstance(node, ast.stmt)]
-    return sum(not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)) for node in statements)
+    return sum(
+        not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)) for node in statements
+    )
 
 
 def local_names(function: Function) -> set[str]:
@@ -169,7 +171,9 @@ def format_table(counts: dict[str, Counter[str]]) -> str:
     """A table of the counts, a line for each package and one for their sum."""
     total = sum(counts.values(), Counter[str]())
     rows = [("package", *COLUMNS)]
-    rows += [(name, *(str(found[key]) for key in COLUMNS)) for name, found in {**counts, "total": total}.items()]
+    rows += [
+        (name, *(str(found[key]) for key in COLUMNS)) for name, found in {**counts, "total": total}.items()
+    ]
     share = 100 * total["long_lines"] / max(total["lines"], 1)
     table = "\n".join("".join(f"{cell:>16}" for cell in row) for row in rows)
     return f"{table}\n{share:.2f} % of the lines have more than {MAX_COLUMNS} columns"

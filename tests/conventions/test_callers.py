@@ -107,7 +107,9 @@ def overrides_a_library(definition: Definition, own: set[str]) -> bool:
     if not definition.owner.bases or definition.module not in own:
         return False
     kind = getattr(importlib.import_module(definition.module), definition.owner.name)
-    return any(hasattr(base, definition.name) for base in kind.__mro__ if base.__module__.split(".")[0] != "viewmend")
+    return any(
+        hasattr(base, definition.name) for base in kind.__mro__ if base.__module__.split(".")[0] != "viewmend"
+    )
 
 
 def test_every_public_name_is_used():
@@ -134,7 +136,9 @@ def test_unused_names_are_found(tmp_path):
     (tmp_path / "made_up").mkdir()
     (tmp_path / "made_up/new.py").write_text(UNUSED)
     (tmp_path / "made_up/used.py").write_text("SIZE = 3\ndef draw(): ...\ndef cut(): ...\n")
-    (tmp_path / "made_up/user.py").write_text('from made_up import used\n"""See cut of used."""\nused.draw()\n')
+    (tmp_path / "made_up/user.py").write_text(
+        'from made_up import used\n"""See cut of used."""\nused.draw()\n'
+    )
     found = [f"made_up.new:{name}" for name in ("UNREAD", "Alias", "lonely", "Idle", "Busy.idle")]
     assert unused(tmp_path, {"offered"}) == [*found, "made_up.used:cut"]
     assert "made_up.new:offered" in unused(tmp_path, set())

@@ -20,7 +20,11 @@ def parts(name: str, value: object) -> Iterator[tuple[str, FunctionType]]:
     if isinstance(value, FunctionType):
         yield name, value
     elif inspect.isclass(value):
-        own = {k: f for k, f in vars(value).items() if isinstance(f, FunctionType) and f.__module__ == value.__module__}
+        own = {
+            k: f
+            for k, f in vars(value).items()
+            if isinstance(f, FunctionType) and f.__module__ == value.__module__
+        }
         hidden = {"__init__"} if "__dataclass_fields__" in vars(value) else set()
         for key, inner in own.items():
             if key not in hidden and (key == "__init__" or not key.startswith("_")):
@@ -37,7 +41,9 @@ def faults(name: str, value: object) -> list[str]:
         parameters = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
         if len(parameters) >= MANY_PARAMETERS and "Args:" not in text:
             found.append(f"{part} has {len(parameters)} parameters and no Args:")
-        raises = any(isinstance(n, ast.Raise) for n in ast.walk(ast.parse(dedent(inspect.getsource(function)))))
+        raises = any(
+            isinstance(n, ast.Raise) for n in ast.walk(ast.parse(dedent(inspect.getsource(function))))
+        )
         if raises and "Error" not in text:
             found.append(f"{part} raises errors that it does not document")
     return found

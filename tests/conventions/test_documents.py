@@ -51,7 +51,9 @@ def missing_names(text: str) -> list[str]:
 
 
 def test_files_and_functions_exist():
-    assert {p.name: m for p in PAGES if p.name != "CHANGELOG.md" and (m := missing_names(p.read_text()))} == {}
+    assert {
+        p.name: m for p in PAGES if p.name != "CHANGELOG.md" and (m := missing_names(p.read_text()))
+    } == {}
     rows = [r for r in (ROOT / "docs/paper-map.md").read_text().splitlines() if re.match(r"\| \d+ \| \d", r)]
     assert len(rows) == 28 and all(any(line for _, _, line in NAMED.findall(row)) for row in rows)
 
@@ -60,7 +62,9 @@ def test_a_missing_file_function_or_line_is_found():
     row = "`models/paper/tokenizer.py: blend` | `mended = error` |"
     assert missing_names("`stream.py: Stream`") == []
     assert missing_names("`stream.py: Strom`, `nowhere.py`") == ["stream.py: Strom", "nowhere.py: "]
-    assert missing_names(row.replace("mended = error", "no such line")) == ["models/paper/tokenizer.py: blend"]
+    assert missing_names(row.replace("mended = error", "no such line")) == [
+        "models/paper/tokenizer.py: blend"
+    ]
 
 
 def test_links_lead_to_files():
@@ -130,6 +134,8 @@ def test_commands_and_options_exist():
 def test_python_blocks_import_what_exists():
     for page in PAGES:
         for kind, body in BLOCK.findall(page.read_text()):
-            lines = [line.strip() for line in body.splitlines() if re.match(r" *(from|import) viewmend", line)]
+            lines = [
+                line.strip() for line in body.splitlines() if re.match(r" *(from|import) viewmend", line)
+            ]
             if kind == "python" and lines:
                 exec("\n".join(lines), {})

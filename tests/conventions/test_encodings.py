@@ -21,7 +21,9 @@ def test_text_files_have_an_encoding():
 
 def has_no_encoding(call: ast.Call) -> bool:
     """Whether a method of a path is called that uses the locale's encoding."""
-    if not isinstance(call.func, ast.Attribute) or any(keyword.arg == "encoding" for keyword in call.keywords):
+    if not isinstance(call.func, ast.Attribute) or any(
+        keyword.arg == "encoding" for keyword in call.keywords
+    ):
         return False
     if call.func.attr == "open":
         return [ast.unparse(mode) for mode in call.args[:1]] in (["'r'"], ["'w'"], ["'a'"], ["'x'"])

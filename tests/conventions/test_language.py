@@ -11,7 +11,10 @@ def prose() -> list[Path]:
     """Sources with their page and model cards, and the documents; laboratory notes are dated and exempt."""
     kinds = {".py", ".js", ".html", ".css", ".md", ".toml"}
     found = [
-        path for folder in ("src", "docs", "examples") for path in (ROOT / folder).rglob("*") if path.suffix in kinds
+        path
+        for folder in ("src", "docs", "examples")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in kinds
     ]
     return sorted([*found, *ROOT.glob("*.md")])
 

@@ -7,15 +7,15 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 140,
-    "walruses": 90,
-    "prepositions": 100,
-    "late_constants": 51,
-    "statements": 4,
+    "parallel": 122,
+    "walruses": 82,
+    "prepositions": 99,
+    "late_constants": 49,
+    "statements": 3,
     "locals": 33,
 }
 """The most of each pattern in the package."""
-MAX_LONG_LINES_PERCENT = 5.6
+MAX_LONG_LINES_PERCENT = 3.1
 """The most lines over 110 columns, per cent of the non-blank lines."""
 
 

@@ -34,7 +34,11 @@ def test_type_checkers_find_the_names():
 
 def test_the_reference_documents_each():
     page = (ROOT / "docs/api.md").read_text().split()
-    shown = {name: f"{getattr(viewmend, name).__module__}.{name}" for name in viewmend.__all__ if name != "__version__"}
+    shown = {
+        name: f"{getattr(viewmend, name).__module__}.{name}"
+        for name in viewmend.__all__
+        if name != "__version__"
+    }
     assert [place for place in shown.values() if place not in page] == []
 
 
@@ -45,7 +49,10 @@ def test_an_unknown_name_is_an_attribute_error():
 
 def test_importing_the_package_loads_no_library():
     check = "import sys, viewmend; dir(viewmend); print([m for m in ('torch', 'numpy', 'cv2') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True).stdout
+        == "[]\n"
+    )
 
 
 def test_the_installed_package_is_typed_and_has_a_version():

@@ -23,7 +23,9 @@ def ring() -> Cameras:
         angle = torch.tensor(view * 1.6)
         eye = torch.stack([2 * angle.cos(), torch.tensor(0.3 * view), 2 * angle.sin()])
         poses.append(
-            pinhole(0.7, WIDTH, HEIGHT, look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), NAMES[view])
+            pinhole(
+                0.7, WIDTH, HEIGHT, look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), NAMES[view]
+            )
         )
     return concatenate_cameras(poses)
 
@@ -59,7 +61,9 @@ class PlainFolder:
         }
         for view, name in enumerate(NAMES):
             for frame in FRAMES:
-                self.put(f"images/{name}_{frame}.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+                self.put(
+                    f"images/{name}_{frame}.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+                )
                 self.put(f"masks/{name}_{frame}.png", masks[view])
         self.save()
 

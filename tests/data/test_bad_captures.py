@@ -97,7 +97,10 @@ BAD = {
     "bounds order": (whole(bounds=[[1, 1, 1], [-1, -1, -1]]), [FILE, "bounds", "low corner"]),
     "bounds shape": (whole(bounds=[[1, 1], [2, 2]]), [FILE, "bounds[0]", "a list of length 3", "got [1, 1]"]),
     "no up": (whole(up=[0, 0, 0]), [FILE, "up", "a direction"]),
-    "one camera": (lambda p: p.edit(lambda d: d["cameras"].__delitem__(slice(1, 4))), [FILE, "two cameras", "got 1"]),
+    "one camera": (
+        lambda p: p.edit(lambda d: d["cameras"].__delitem__(slice(1, 4))),
+        [FILE, "two cameras", "got 1"],
+    ),
     "camera is text": (lambda p: p.edit(lambda d: d["cameras"].append("e")), [FILE, "cameras[4]", 'got "e"']),
     "same names": (camera(name="a"), [FILE, "cameras", "different names", "['a'] more than once"]),
     "no name": (camera(name=""), [FILE, "cameras[1]", "name"]),
@@ -119,9 +122,15 @@ BAD = {
     "image and video": (camera(video="b.avi"), [FILE, B, "either 'image' or 'video'", "both"]),
     "neither": (camera(image=None), [FILE, B, "either 'image' or 'video'", "neither"]),
     "absolute path": (camera(image="/tmp/b.png"), [FILE, B, "image", "inside the capture", "/tmp/b.png"]),
-    "path upwards": (camera(mask="masks/../../b.png"), [FILE, B, "mask", "inside the capture", "../../b.png"]),
+    "path upwards": (
+        camera(mask="masks/../../b.png"),
+        [FILE, B, "mask", "inside the capture", "../../b.png"],
+    ),
     "drive": (camera(image="C:\\b.png"), [FILE, B, "image", "inside the capture"]),
-    "camera without images": (camera(image="nowhere/{frame}.png"), ["nowhere/000.png", B, "none in 2 frames", FILE]),
+    "camera without images": (
+        camera(image="nowhere/{frame}.png"),
+        ["nowhere/000.png", B, "none in 2 frames", FILE],
+    ),
     "camera without masks": (camera(mask="nowhere.png"), ["nowhere.png", B, "the camera's mask", FILE]),
     "never both": (
         remove("images/b_000.png", "masks/b_001.png"),
@@ -144,14 +153,23 @@ BAD = {
     "image cut short": (cut("images/b_000.png"), ["images/b_000.png", B, "frame '000'", "truncated"]),
     "image is text": (write("images/b_000.png", b"hello"), ["images/b_000.png", B, "frame '000'", "5 bytes"]),
     "image is empty": (write("images/b_000.png", b""), ["images/b_000.png", B, "frame '000'", "0 bytes"]),
-    "image size": (picture("images/b_000.png", of_pixels(16, 20)), ["b_000.png", B, "'000'", "40 x 32", "got 20 x 16"]),
-    "mask size": (picture("masks/b_000.png", of_pixels(16, 20)), ["masks/b_000.png", B, "'000'", "got 20 x 16"]),
+    "image size": (
+        picture("images/b_000.png", of_pixels(16, 20)),
+        ["b_000.png", B, "'000'", "40 x 32", "got 20 x 16"],
+    ),
+    "mask size": (
+        picture("masks/b_000.png", of_pixels(16, 20)),
+        ["masks/b_000.png", B, "'000'", "got 20 x 16"],
+    ),
     "mask of 16 bit": (
         picture("masks/b_000.png", np.arange(32 * 40, dtype=np.uint16).reshape(32, 40)),
         ["masks/b_000.png", B, "frame '000'", "8-bit mask", "uint16"],
     ),
     "empty masks": (every_mask(of_pixels(32, 40) * 0), ["expected foreground", "none in 2 frames"]),
-    "faint masks": (every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))), ["above 127", "none in 2 frames"]),
+    "faint masks": (
+        every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))),
+        ["above 127", "none in 2 frames"],
+    ),
     "no video": (lambda p: (video(2)(p), (p.path / "b.avi").unlink()), ["b.avi", B, "the camera's video"]),
     "video is text": (lambda p: (video(2)(p), write("b.avi", b"hello" * 99)(p)), ["b.avi", B, "a video"]),
     "depth of 8 bit": (depth_of_8_bit, ["depth.png", "camera 'a'", "frame '000'", "16-bit", "uint8"]),
@@ -178,7 +196,12 @@ def test_a_time_that_is_not_there(plain, capfd):
 
 
 def test_a_frame_without_masks_of_a_format_that_lists_no_frames(tmp_path):
-    lens = {"K": np.array([[50.0, 0, 20], [0, 50, 16], [0, 0, 1]]), "dist": np.zeros(5), "width": 40, "height": 32}
+    lens = {
+        "K": np.array([[50.0, 0, 20], [0, 50, 16], [0, 0, 1]]),
+        "dist": np.zeros(5),
+        "width": 40,
+        "height": 32,
+    }
     rig = [lens | {"name": name, "R": np.eye(3), "t": np.zeros(3)} for name in "12"]
     write_easymocap(tmp_path, rig)
     write_take(tmp_path, rig, ("000000", "000001"), (), "images/{c}/{f}.png", "masks/{c}/{f}.png")

@@ -66,7 +66,8 @@ def test_units_become_metres(plain, metres_per_unit):
 
 
 @pytest.mark.parametrize(
-    ("first", "shift"), [([0.5, 0.5], (0, 0)), ([0, 0], (0.5, 0.5)), ([1, 0], (-0.5, 0.5)), (None, (0.5, 0.5))]
+    ("first", "shift"),
+    [([0.5, 0.5], (0, 0)), ([0, 0], (0.5, 0.5)), ([1, 0], (-0.5, 0.5)), (None, (0.5, 0.5))],
 )
 def test_pixel_centres_become_one_half(plain, first, shift):
     truth = torch.tensor([camera["K"] for camera in plain.description["cameras"]])
@@ -92,7 +93,9 @@ def test_smaller_images_are_padded_right_and_below(plain):
     assert frame.cameras.size_px.tolist() == [[40, 32], [30, 20], [40, 32], [40, 32]]
     assert frame.rgb.shape == (4, 3, 32, 40)
     assert (frame.rgb[1, :, :20, :30] == 77).all() and (frame.mask[1, :20, :30] == 255).all()
-    assert not frame.rgb[1, :, 20:].any() and not frame.rgb[1, :, :, 30:].any() and not frame.mask[1, 20:].any()
+    assert (
+        not frame.rgb[1, :, 20:].any() and not frame.rgb[1, :, :, 30:].any() and not frame.mask[1, 20:].any()
+    )
     alone = frame.select(["b"])
     assert alone.rgb.shape == (1, 3, 20, 30) and alone.mask.shape == (1, 20, 30)
 
@@ -257,7 +260,9 @@ def test_images_and_masks_may_be_videos(plain):
     assert (frame.rgb[0, 0] > 240).all() and (frame.rgb[0, 1:] < 15).all()
     expected = torch.ones(32, 40, dtype=torch.bool)
     expected[8:24, 8:24] = False
-    assert torch.equal(frame.mask[0] > 127, expected) and torch.equal(capture.read(0).mask[0] > 127, ~expected)
+    assert torch.equal(frame.mask[0] > 127, expected) and torch.equal(
+        capture.read(0).mask[0] > 127, ~expected
+    )
 
 
 def test_written_videos_keep_size_and_colour(tmp_path):

@@ -22,7 +22,9 @@ def cube():
     front = torch.eye(4)
     front[2, 3] = 3
     side = torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 3], [0, 0, 0, 1]])
-    cameras = Cameras(("front", "side"), K.expand(2, 3, 3), torch.stack([front, side]), torch.tensor([[100, 80]] * 2))
+    cameras = Cameras(
+        ("front", "side"), K.expand(2, 3, 3), torch.stack([front, side]), torch.tensor([[100, 80]] * 2)
+    )
     mask = torch.zeros(2, 80, 100, dtype=torch.uint8)
     mask[:, 25:55, 35:65] = 255
     return MultiViewFrame(cameras, torch.full((2, 3, 80, 100), 100, dtype=torch.uint8), mask, 0)

@@ -17,7 +17,11 @@ from viewmend.data.checks import leave_one_out, synchronisation
 from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.leave_one_out import OthersHulls, find_outlier_by_hull, find_outlier_by_outlines
-from viewmend.data.checks.synchronisation import check_image_mask_sync, describe_delay, find_desynchronised_cameras
+from viewmend.data.checks.synchronisation import (
+    check_image_mask_sync,
+    describe_delay,
+    find_desynchronised_cameras,
+)
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.studio.stage import Studio, StudioConfig
@@ -91,7 +95,9 @@ def double_intrinsics(content):
 FATAL = {
     "camera-to-world;": lambda f: change_poses(f, lambda R, t: (R.T, -R.T @ t)),
     "OpenGL axes": lambda f: change_poses(f, flip),
-    "camera-to-world with OpenGL axes": lambda f: change_poses(f, lambda R, t: (R.T @ np.diag([1, -1, -1]), -R.T @ t)),
+    "camera-to-world with OpenGL axes": lambda f: change_poses(
+        f, lambda R, t: (R.T @ np.diag([1, -1, -1]), -R.T @ t)
+    ),
     "R is camera-to-world (transposed)": lambda f: change_poses(f, lambda R, t: (R.T, t)),
     "t is the camera's centre": lambda f: change_poses(f, lambda R, t: (R, -R.T @ t)),
     "check metres_per_unit": lambda f: change_poses(f, lambda R, t: (R, 100 * t)),
@@ -125,7 +131,9 @@ def test_fatal_mistakes_are_explained(folder, words):
 
 def test_all_commands_report_the_same(folder, capsys):
     change_poses(folder, flip)
-    assert main(["mend", str(folder), "--out", str(folder / "out"), "--path", "orbit", "--model", "telea"]) == 2
+    assert (
+        main(["mend", str(folder), "--out", str(folder / "out"), "--path", "orbit", "--model", "telea"]) == 2
+    )
     message = capsys.readouterr().err
     assert main(["serve", str(folder), "--port", "0", "--model", "telea"]) == 2
     assert capsys.readouterr().err == message and "http" not in message
@@ -175,7 +183,10 @@ def test_a_held_out_camera_affects_no_other(folder, caplog):
     held, *inputs = names_of(folder)
     before = prepare(open_capture(folder), inputs, align=False).read(0)
     change_images(folder, empty, held)
-    assert held in prepare(open_capture(folder), inputs, align=False).read(0).cameras.names and not caplog.messages
+    assert (
+        held in prepare(open_capture(folder), inputs, align=False).read(0).cameras.names
+        and not caplog.messages
+    )
     change_images(folder, lambda mask: 0 * mask + 255, held)
     after = prepare(open_capture(folder), inputs, align=False).read(0)
     assert before.cameras.names == after.cameras.names and "scores against it are meaningless" in caplog.text
@@ -300,7 +311,10 @@ def test_frames_that_were_lost_on_the_way_are_found(moving, tmp_path, monkeypatc
     (issue,) = find_desynchronised_cameras(capture, capture.read(0), last=4)
     assert f"camera '{name}': early by about 1 frame" in issue.text
     first, last = capture.frame_ids[0], capture.frame_ids[4]
-    assert f"(at frame '{last}', but not at frame '{first}': frames were lost or repeated in between)" in issue.text
+    assert (
+        f"(at frame '{last}', but not at frame '{first}': frames were lost or repeated in between)"
+        in issue.text
+    )
 
 
 # EXIF orientation.
@@ -311,10 +325,16 @@ def to_jpeg(folder, orientation, crop=96):
     name = names_of(folder)[3]
     for path in folder.glob(f"image/{name}/*.png"):
         _, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
-        tiff = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+        tiff = (
+            b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0"
+            + bytes([orientation])
+            + b"\0\0\0\0\0\0"
+        )
         head = b"\xff\xd8\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff
         path.with_suffix(".jpg").write_bytes(head + data.tobytes()[2:])
-    edit_description(folder, lambda content: content["cameras"][3].update(image=f"image/{name}/{{frame}}.jpg"))
+    edit_description(
+        folder, lambda content: content["cameras"][3].update(image=f"image/{name}/{{frame}}.jpg")
+    )
 
 
 @pytest.mark.parametrize(("orientation", "words"), [(3, "turned by 180 degrees"), (2, "mirrored")])
@@ -324,7 +344,12 @@ def test_exif_rotation_is_reported_once(folder, caplog, orientation, words):
     capture.read(0)
     capture.read(1)
     found = [text for text in caplog.messages if "EXIF" in text]
-    assert len(found) == 1 and words in found[0] and f"'{names_of(folder)[3]}'" in found[0] and "exiftran" in found[0]
+    assert (
+        len(found) == 1
+        and words in found[0]
+        and f"'{names_of(folder)[3]}'" in found[0]
+        and "exiftran" in found[0]
+    )
 
 
 def test_exif_rotation_explains_a_wrong_size(folder):
@@ -376,7 +401,9 @@ def test_inverted_masks_are_fatal_from_half_of_them_on(ball, count):
         assert not any(issue.fatal for issue in issues)
     else:
         assert len(issues) == 1 and issues[0].fatal and f"in {count} of 8 cameras" in issues[0].text
-        assert [issue.fatal for issue in find_bad_masks(frame, names[2:6], None)] == [True], "half of the inputs"
+        assert [issue.fatal for issue in find_bad_masks(frame, names[2:6], None)] == [True], (
+            "half of the inputs"
+        )
 
 
 def chequered(times, delay=0, view=1, size=64):
@@ -496,7 +523,9 @@ def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio):
         assert find_outlier_by_outlines(other, studio.bounds) is None
 
 
-@pytest.mark.parametrize(("step_m", "words"), [(0.06, "alone removes"), (0.02, "outlines of the other cameras agree")])
+@pytest.mark.parametrize(
+    ("step_m", "words"), [(0.06, "alone removes"), (0.02, "outlines of the other cameras agree")]
+)
 def test_a_displaced_camera_is_diagnosed_once(studio, step_m, words):
     """A large step shows in the hull; a small one only in the outlines."""
     issues = diagnose(displace(studio.read(0), "cam03", (step_m, 0.0, 0.0)), studio.bounds)

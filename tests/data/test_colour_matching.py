@@ -82,7 +82,10 @@ def test_what_is_clipped_is_no_measurement(studio, monkeypatch, rng):
 
 def test_what_maps_bring_is_judged_where_they_were_not_fitted(studio, monkeypatch, rng):
     """Gains that are other ones from part to part: what three parts say makes the fourth worse."""
-    gain = torch.tensor([1.0, -1.0, 1.0, -1.0]).repeat_interleave(300) * torch.linspace(-0.05, 0.05, CAMERAS)[:, None]
+    gain = (
+        torch.tensor([1.0, -1.0, 1.0, -1.0]).repeat_interleave(300)
+        * torch.linspace(-0.05, 0.05, CAMERAS)[:, None]
+    )
     surface(monkeypatch, (1 + gain[..., None]) * (0.3 + 0.4 * torch.rand(1, 1200, 3, generator=rng)))
     match = match_colours(studio.read(0), studio.bounds)
     assert match.after > 1.1 * match.before and not match.helps
@@ -136,7 +139,17 @@ def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
 def test_mend_says_that_colours_are_matched(studio, tmp_path, capsys):
     write_capture(Tinted(studio), tmp_path / "take", images="png")
     take, out = str(tmp_path / "take"), str(tmp_path / "out")
-    arguments = ["mend", take, "--leave-out", studio.cameras.names[0], "--model", "telea", "--no-align", "--out", out]
+    arguments = [
+        "mend",
+        take,
+        "--leave-out",
+        studio.cameras.names[0],
+        "--model",
+        "telea",
+        "--no-align",
+        "--out",
+        out,
+    ]
     assert main(arguments) == 0
     assert "matched the colours of 7 cameras" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "out")

@@ -71,7 +71,9 @@ def test_genebody_round_trip(seed, count, protocol):
 
 
 @TAKES
-@given(SEEDS, COUNTS, st.sampled_from([(120 / 65, (4096, 3000), (512, 375)), (2.5, (2448, 2048), (153, 128))]))
+@given(
+    SEEDS, COUNTS, st.sampled_from([(120 / 65, (4096, 3000), (512, 375)), (2.5, (2448, 2048), (153, 128))])
+)
 def test_mvhumannet_round_trip(seed, count, sizes):
     scale, full, size = sizes
     with random_folder(seed, count, "CC32871A0{:02d}", "{:04d}", 0) as (folder, rig, frames, gaps):
@@ -236,14 +238,18 @@ def test_one_of_several_sequences_is_opened_by_its_file(tmp_path):
     rig = named(random_rig(3, 3), "{:02d}")
     for name in ("0012_11", "0013_01"):
         main = studios.write_dna(tmp_path, rig, ["0", "1"], apart=True, name=name)
-    with pytest.raises(CaptureError, match=r"expected one sequence, got 2 in .*; open one of them, e.g. 0012_11.smc"):
+    with pytest.raises(
+        CaptureError, match=r"expected one sequence, got 2 in .*; open one of them, e.g. 0012_11.smc"
+    ):
         open_capture(tmp_path)
     capture = open_capture(main)
     assert capture.name == "0013_01" and len(capture_set(main, frames=1)) == 3
     annotations = tmp_path / "part1_annotations/0013_01_annots.smc"
     assert open_capture(annotations).cameras.names == capture.cameras.names
     annotations.unlink()
-    with pytest.raises(CaptureError, match=r"expected 0013_01_annots\.smc next to it or in the folder of annotations"):
+    with pytest.raises(
+        CaptureError, match=r"expected 0013_01_annots\.smc next to it or in the folder of annotations"
+    ):
         open_capture(main)
 
 
@@ -262,7 +268,9 @@ def test_hdf5_files_do_not_lead_to_other_files(tmp_path, how):
             color["1"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "image")
         else:
             color.create_dataset("1", (600,), np.uint8, external=[(str(tmp_path / "secret"), 0, 600)])
-    with pytest.raises(CaptureError, match=r"expected a readable file, got: (no|its data are stored in another file)"):
+    with pytest.raises(
+        CaptureError, match=r"expected a readable file, got: (no|its data are stored in another file)"
+    ):
         open_capture(tmp_path).read(1)
 
 
@@ -303,7 +311,11 @@ def test_the_meta_file_of_riftcast_has_bounds_up_and_frames(tmp_path):
         capture = open_capture(path)
         assert capture.frame_ids == ("00001", "00002") and capture.up.tolist() == [0, -1, 0]
         # The corners of the cube, (-1.5, 0, -1.5) and (1.5, 3, 1.5), moved by to_world, then with y and z negated.
-        assert capture.bounds.low.tolist() == [-0.5, -5, -4.5] and capture.bounds.high.tolist() == [2.5, -2, -1.5]
+        assert capture.bounds.low.tolist() == [-0.5, -5, -4.5] and capture.bounds.high.tolist() == [
+            2.5,
+            -2,
+            -1.5,
+        ]
 
 
 @pytest.mark.parametrize(

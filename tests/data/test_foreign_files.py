@@ -46,7 +46,9 @@ def written(inside):
         "two levels": Image.fromarray(inside),
         "colours of 16 bit": np.repeat(65535 * inside.astype(np.uint16)[..., None], 3, 2),
         "a palette of 1 bit": palette((label > 0).astype(np.uint8), [[40, 40, 90], [10, 200, 10]]),
-        "several colours and nearly opaque alpha": np.dstack([several[label], np.full(inside.shape, 254, np.uint8)]),
+        "several colours and nearly opaque alpha": np.dstack(
+            [several[label], np.full(inside.shape, 254, np.uint8)]
+        ),
         "grey and alpha": Image.fromarray(np.dstack([0 * label + 255, 255 * inside]).astype(np.uint8), "LA"),
     }
 
@@ -64,7 +66,9 @@ def test_masks_mean_the_same(plain, kind):
 def test_labels_are_mentioned_once_and_faint_masks_are_no_labels(plain, caplog):
     for time in (0, 1):
         for name in "abcd":
-            plain.put(f"masks/{name}_00{time}.png", written(plain.get(f"masks/{name}_000.png") > 0)["0 and 1"])
+            plain.put(
+                f"masks/{name}_00{time}.png", written(plain.get(f"masks/{name}_000.png") > 0)["0 and 1"]
+            )
     capture = open_capture(plain.path)
     assert (capture.read(0).mask.unique() == capture.read(1).mask.unique()).all()
     assert [record.message for record in caplog.records] == [
@@ -77,7 +81,9 @@ def test_labels_are_mentioned_once_and_faint_masks_are_no_labels(plain, caplog):
     plain.put("masks/a_000.png", written(plain.get("masks/a_000.png") > 0)["0 and 128"])
     assert set(open_capture(plain.path).read(0).mask[0].unique().tolist()) == {0, 255}
     assert "masks of a, c, d have no values above 128" in caplog.text
-    plain.put("masks/a_000.png", np.eye(32, 40, dtype=np.uint8) // np.arange(1, 41, dtype=np.uint8))  # one faint pixel
+    plain.put(
+        "masks/a_000.png", np.eye(32, 40, dtype=np.uint8) // np.arange(1, 41, dtype=np.uint8)
+    )  # one faint pixel
     assert open_capture(plain.path).read(0).mask[0].max() == 1
 
 
@@ -89,14 +95,17 @@ def test_labels_survive_jpeg(plain, caplog):
         (plain.path / f"masks/{name}_000.png").write_bytes(data.tobytes())
     mask = open_capture(plain.path).read(0).mask
     assert "they are scaled, with 12" in caplog.text or "they are scaled, with 13" in caplog.text
-    assert ((mask > 127) == (expected > 127)).float().mean() > 0.99 and mask[expected > 0].float().median() > 240
+    assert ((mask > 127) == (expected > 127)).float().mean() > 0.99 and mask[
+        expected > 0
+    ].float().median() > 240
 
 
 def test_a_coloured_background_is_refused(plain):
     inside = plain.get("masks/a_000.png") > 0
     plain.put("masks/a_000.png", np.where(inside[..., None], [37, 231, 253], [84, 1, 68]).astype(np.uint8))
     with pytest.raises(
-        CaptureError, match=r"a_000\.png.*expected black as a mask's background, got the colours 253 231 37, 68 1"
+        CaptureError,
+        match=r"a_000\.png.*expected black as a mask's background, got the colours 253 231 37, 68 1",
     ):
         open_capture(plain.path).read(0)
 
@@ -120,7 +129,10 @@ def test_alpha_of_any_image_counts(tmp_path, caplog):
     blender(tmp_path, {"a": None, "b": cut, "c": cut.astype(np.uint16) * 257})
     assert open_capture(tmp_path).read(0).mask.sum().item() == 2 * 300 * 255
     assert "cameras without their image are left out: a" in caplog.text
-    for picture, got in ((opaque, "got 3 channels"), (np.dstack([opaque, opaque[..., 0]]), "got an opaque image")):
+    for picture, got in (
+        (opaque, "got 3 channels"),
+        (np.dstack([opaque, opaque[..., 0]]), "got an opaque image"),
+    ):
         blender(tmp_path, {"a": picture, "b": cut, "c": cut})
         with pytest.raises(CaptureError, match=f"a.png: camera 'a', frame '0': expected .*alpha.*{got}"):
             open_capture(tmp_path).read(0)
@@ -135,7 +147,9 @@ def test_images_without_suffix_may_have_any(tmp_path):
     assert open_capture(tmp_path).read(0).cameras.names == ("a", "b", "c", "d")
     for file in [file for file in tmp_path.iterdir() if file.suffix != ".json"]:
         file.unlink()
-    with pytest.raises(CaptureError, match=r"expected an image 'a', or this with an image suffix .* got none; add"):
+    with pytest.raises(
+        CaptureError, match=r"expected an image 'a', or this with an image suffix .* got none; add"
+    ):
         open_capture(tmp_path)
 
 
@@ -184,7 +198,10 @@ def test_text_of_colmap_may_have_other_lines(tmp_path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data.replace(b".png\n\n", b".png\n"), r"images.txt: expected the points .* in line 3, got '14 "),
+        (
+            lambda data: data.replace(b".png\n\n", b".png\n"),
+            r"images.txt: expected the points .* in line 3, got '14 ",
+        ),
         (
             lambda data: data.replace(b".png\n\n", b".png\n1 2\n"),
             r"images.txt: expected the points .* in line 3, got '1 2",
@@ -211,7 +228,9 @@ def films(folder, times=(0, 5, 10), **more):
         for number, entry in enumerate(entries):
             path = f"image\\c{number}_{time:04d}.png"
             (folder / "image").mkdir(exist_ok=True)
-            cv2.imwrite(str(folder / path.replace("\\", "/")), np.full((entry["h"], entry["w"], 3), time, np.uint8))
+            cv2.imwrite(
+                str(folder / path.replace("\\", "/")), np.full((entry["h"], entry["w"], 3), time, np.uint8)
+            )
             frames.append(entry | {"file_path": path, "mask_path": None, "time": time / 10})
     content = {"frames": frames} | more
     (folder / "transforms.json").write_text(json.dumps(content))
@@ -233,7 +252,10 @@ def spoil(content, **changes):
     ("change", "message"),
     [
         (lambda c: spoil(c, time=None), "expected a 'time' in each frame"),
-        (lambda c: [f.pop("time") for f in c["frames"]], "got image/c0_0000.png and image/c0_0005.png at the same"),
+        (
+            lambda c: [f.pop("time") for f in c["frames"]],
+            "got image/c0_0000.png and image/c0_0005.png at the same",
+        ),
         (lambda c: spoil(c, file_path="image/other.png"), "expected equal numbers in file_path"),
         (lambda c: c["frames"].pop(0) and c["frames"].pop(2), "only image/c0_0010.png"),
         (lambda c: c.update(rolling_shutter=[0, 0, 0.02, 0]), "got rolling_shutter"),
@@ -242,8 +264,14 @@ def spoil(content, **changes):
         (lambda c: spoil(c, camera_model="EQUIRECTANGULAR"), "got EQUIRECTANGULAR"),
         (lambda c: c.update(equirectangular=True, from_mitsuba=True), "got equirectangular, from_mitsuba"),
         (lambda c: spoil(c, transform_matrix_start=[[0]]), "got transform_matrix_start other than"),
-        (lambda c: [f.update(time=f["time"] + n / 1e4) for n, f in enumerate(c["frames"])], "equal 'time' for equal"),
-        (lambda c: (spoil(c, depth_file_path="d.png"), c.update(depth_unit_scale_factor=1.0)), "got a scale of 1"),
+        (
+            lambda c: [f.update(time=f["time"] + n / 1e4) for n, f in enumerate(c["frames"])],
+            "equal 'time' for equal",
+        ),
+        (
+            lambda c: (spoil(c, depth_file_path="d.png"), c.update(depth_unit_scale_factor=1.0)),
+            "got a scale of 1",
+        ),
     ],
 )
 def test_keys_that_change_the_meaning_are_not_ignored(tmp_path, change, message):
@@ -265,7 +293,9 @@ def test_unknown_keys_are_mentioned(tmp_path, caplog):
 def test_a_vertical_angle_is_a_focal_length(tmp_path):
     blender(tmp_path, {"a": np.zeros((20, 30, 3), np.uint8), "b": np.zeros((20, 30, 3), np.uint8)})
     file = tmp_path / "transforms_train.json"
-    file.write_text(file.read_text().replace('"camera_angle_x": 0.8', '"camera_angle_x": 0.8, "camera_angle_y": 0.5'))
+    file.write_text(
+        file.read_text().replace('"camera_angle_x": 0.8', '"camera_angle_x": 0.8, "camera_angle_y": 0.5')
+    )
     cameras = open_capture(tmp_path).cameras
     assert cameras.K[0, 1, 1].item() == pytest.approx(10 / np.tan(0.25))
     assert cameras.K[0, 0].tolist() == pytest.approx([15 / np.tan(0.4), 0, 15]) and cameras.K[0, 1, 2] == 10
@@ -331,8 +361,12 @@ def test_files_are_found_in_each_unicode_form(plain, tmp_path):
 
 
 def test_images_named_by_clocks_are_refused(tmp_path):
-    names = mocap(tmp_path, [[f"{1700000000000 + 33 * time + camera}" for time in range(4)] for camera in range(4)])
-    with pytest.raises(CaptureError, match=f"expected the same frame ids .* 1700000000001 of {names[1]}.* rename"):
+    names = mocap(
+        tmp_path, [[f"{1700000000000 + 33 * time + camera}" for time in range(4)] for camera in range(4)]
+    )
+    with pytest.raises(
+        CaptureError, match=f"expected the same frame ids .* 1700000000001 of {names[1]}.* rename"
+    ):
         open_capture(tmp_path)
 
 
@@ -342,7 +376,9 @@ def test_a_single_image_of_each_camera_is_one_moment(tmp_path, caplog, name):
     cameras = mocap(tmp_path, ids)
     capture = open_capture(tmp_path)
     assert len(capture.frame_ids) == 1 and not capture.gaps and capture.has_masks
-    assert capture.read(0).cameras.names == tuple(cameras) and bool((capture.read(0).mask[:, 0, 0] == 255).all())
+    assert capture.read(0).cameras.names == tuple(cameras) and bool(
+        (capture.read(0).mask[:, 0, 0] == 255).all()
+    )
     said = f"names differ: images/{cameras[0]}/{ids[0][0]}.png, images/{cameras[1]}/{ids[1][0]}.png"
     assert (said in caplog.text) == (name != "0001")
 
@@ -365,7 +401,9 @@ def test_masks_may_have_other_names_than_single_images(tmp_path):
 )
 def test_short_footage_with_other_ids_is_refused(tmp_path, ids, got):
     names = mocap(tmp_path, ids)
-    with pytest.raises(CaptureError, match=f"expected the same frame ids .* got others {got.format(*names)}.*rename"):
+    with pytest.raises(
+        CaptureError, match=f"expected the same frame ids .* got others {got.format(*names)}.*rename"
+    ):
         open_capture(tmp_path)
 
 
@@ -374,7 +412,9 @@ def test_masks_with_other_ids_are_refused_and_further_masks_are_not_used(tmp_pat
     for name in names:
         for number in (1, 2):
             (tmp_path / f"a/masks/{name}/{number}.png").rename(tmp_path / f"a/masks/{name}/00{number}.png")
-    with pytest.raises(CaptureError, match=rf"{names[2]} \(masks\) \(such as 1 of {names[0]}, 001 of {names[0]} \(m"):
+    with pytest.raises(
+        CaptureError, match=rf"{names[2]} \(masks\) \(such as 1 of {names[0]}, 001 of {names[0]} \(m"
+    ):
         open_capture(tmp_path / "a")
     names = mocap(tmp_path / "b", [["1", "2", "3", "4", "5"]] * 3)
     for name in names:
@@ -396,7 +436,9 @@ def test_numbers_that_begin_elsewhere_are_mentioned(tmp_path, caplog):
     open_capture(tmp_path / "a")
     assert f"begin at 0, but at 1 for {names[1]}, {names[1]} (masks); if" in caplog.text
     caplog.clear()
-    mocap(tmp_path / "b", [["0", "1", "2", "3"], ["1", "2", "3"], ["0", "1", "2", "3"]])  # the first image is missing
+    mocap(
+        tmp_path / "b", [["0", "1", "2", "3"], ["1", "2", "3"], ["0", "1", "2", "3"]]
+    )  # the first image is missing
     open_capture(tmp_path / "b")
     assert not caplog.records
 
@@ -405,7 +447,10 @@ def test_images_with_other_names_are_mentioned(tmp_path, caplog):
     names = mocap(tmp_path, [["preview", "0001", "0002", "0003", "0001 (1)"]] * 3)
     assert open_capture(tmp_path).frame_ids == ("0001", "0002", "0003")
     (said,) = [record.message for record in caplog.records]
-    assert f"images of {names[0]}: 2 of 5, such as 0001 (1).png, are ignored, as their names follow another" in said
+    assert (
+        f"images of {names[0]}: 2 of 5, such as 0001 (1).png, are ignored, as their names follow another"
+        in said
+    )
 
 
 @pytest.mark.parametrize(
@@ -415,10 +460,16 @@ def test_images_with_other_names_are_mentioned(tmp_path, caplog):
 def test_names_with_several_numbers_are_matched_as_a_whole(tmp_path, clock):
     """Such as clocks across a second, and numbers with a clock; those of each camera's own are refused."""
     moments = [(time, 20 + (930 + 33 * time) // 1000, (930 + 33 * time) % 1000) for time in range(4)]
-    ids = [[clock.format(time=t, second=s, milli=m + 9 * camera) for t, s, m in moments] for camera in range(3)]
+    ids = [
+        [clock.format(time=t, second=s, milli=m + 9 * camera) for t, s, m in moments] for camera in range(3)
+    ]
     mocap(tmp_path / "equal", ids[:1] * 3)
     capture = open_capture(tmp_path / "equal")
-    assert len(capture.frame_ids) == 4 and not capture.gaps and list(capture.frame_ids) == sorted(capture.frame_ids)
+    assert (
+        len(capture.frame_ids) == 4
+        and not capture.gaps
+        and list(capture.frame_ids) == sorted(capture.frame_ids)
+    )
     mocap(tmp_path / "own", ids)
     with pytest.raises(CaptureError, match="expected the same frame ids in the names of all cameras' images"):
         open_capture(tmp_path / "own")
@@ -429,7 +480,9 @@ def test_captures_inside_the_folder_are_named(plain, tmp_path):
     (tmp_path / "notes").mkdir()
     for format, takes in ((None, "ball, take_1"), ("plain", "ball"), ("easymocap", "take_1")):
         first = tmp_path / takes.split(",")[0]
-        with pytest.raises(CaptureError, match=rf"got a folder of captures \({takes}\); open one, such as {first}"):
+        with pytest.raises(
+            CaptureError, match=rf"got a folder of captures \({takes}\); open one, such as {first}"
+        ):
             open_capture(tmp_path, format=format)
     with pytest.raises(CaptureError, match="the folder has neither it nor another format's files"):
         open_capture(tmp_path / "notes")
@@ -442,7 +495,9 @@ def test_captures_inside_the_folder_are_named(plain, tmp_path):
 
 def rig_with_films(folder, name):
     """A rig of three cameras with a film of each in a folder."""
-    rig = [camera | {"width": 64, "height": 48, "name": f"cam{n}"} for n, camera in enumerate(random_rig(7, 3))]
+    rig = [
+        camera | {"width": 64, "height": 48, "name": f"cam{n}"} for n, camera in enumerate(random_rig(7, 3))
+    ]
     for number in range(3):
         write_film(folder / f"{name.format(number)}.mp4", [np.full((48, 64, 3), 9, np.uint8)] * 3)
     return opencv(rig)
@@ -463,7 +518,9 @@ def test_a_trial_of_pose2sim_is_opened_and_its_session_refused(tmp_path, calibra
         (session / "Day_1").mkdir()
         for trial in ("Trial_1", "Trial_2"):
             (session / trial).rename(session / "Day_1" / trial)
-        with pytest.raises(CaptureError, match="got a folder with Day_1/Trial_1, Day_1/Trial_2; open one of these"):
+        with pytest.raises(
+            CaptureError, match="got a folder with Day_1/Trial_1, Day_1/Trial_2; open one of these"
+        ):
             open_capture(session)
 
 

@@ -36,7 +36,11 @@ from viewmend.scenes.capture_scenes import capture_set
 
 # Round trips. A writer takes the folder and the rig, in OpenCV's convention if the format has it.
 
-TOML_FILES = {"pose2sim": "calibration/Calib_scene.toml", "caliscope": "camera_array.toml", "pyxy3d": "config.toml"}
+TOML_FILES = {
+    "pose2sim": "calibration/Calib_scene.toml",
+    "caliscope": "camera_array.toml",
+    "pyxy3d": "config.toml",
+}
 NUMBERED = {"caliscope": lambda name: str(int(name[3:])), "pyxy3d": lambda name: f"cam_{int(name[3:])}"}
 
 
@@ -70,15 +74,25 @@ def agisoft(old, moved):
 
 FORMATS = {
     "transforms": (write_transforms, 5),
-    **{f"colmap {m} {b}": (colmap(m, b), n) for b in (False, True) for m, n in (("PINHOLE", 0), ("OPENCV", 4))},
+    **{
+        f"colmap {m} {b}": (colmap(m, b), n)
+        for b in (False, True)
+        for m, n in (("PINHOLE", 0), ("OPENCV", 4))
+    },
     "colmap FULL_OPENCV": (colmap("FULL_OPENCV", True), 5),
     "colmap RADIAL": (colmap("RADIAL", False), 2),
     "middlebury": (lambda folder, rig: write_middlebury(folder / "ball_par.txt", opencv(rig)), 0),
     **{f"agisoft {o} {m}": (agisoft(o, m), 5) for o in (False, True) for m in (None, 1, 2)},
-    **{f"easymocap {r}": (lambda folder, rig, r=r: write_easymocap(folder, opencv(rig), r), 5) for r in (False, True)},
+    **{
+        f"easymocap {r}": (lambda folder, rig, r=r: write_easymocap(folder, opencv(rig), r), 5)
+        for r in (False, True)
+    },
     **{style: (toml(style), 4 if style == "pose2sim" else 5) for style in (*TOML_FILES, "aniposelib")},
     "qualisys": (lambda folder, rig: write_qualisys(folder / "calibration/Calib.qca.txt", opencv(rig)), 5),
-    **{f"opencv {s}": (lambda folder, rig, s=s: write_opencv(folder, opencv(rig), s), 5) for s in ("files", "folders")},
+    **{
+        f"opencv {s}": (lambda folder, rig, s=s: write_opencv(folder, opencv(rig), s), 5)
+        for s in ("files", "folders")
+    },
 }
 """Writers, and the number of distortion coefficients that the format has."""
 FRAMES = {"easymocap", *TOML_FILES, "aniposelib", "qualisys", "opencv"}
@@ -145,7 +159,10 @@ def test_formats_are_recognised_or_selected(tmp_path):
     write_transforms(tmp_path, random_rig(6, 2))
     assert open_capture(tmp_path, format="colmap").cameras.names == tuple(camera["name"] for camera in rig)
     assert read_any_calibration(tmp_path).file.name == "transforms.json"
-    for name, message in (("easymocap", "got none of its files"), ("fbx", "expected a format among plain, transforms")):
+    for name, message in (
+        ("easymocap", "got none of its files"),
+        ("fbx", "expected a format among plain, transforms"),
+    ):
         with pytest.raises(CaptureError, match=message):
             open_capture(tmp_path, format=name)
 
@@ -175,7 +192,9 @@ def test_convert_writes_the_selected_part(tmp_path, capsys):
 
 def large(rig):
     """The rig with image sizes that a video can have."""
-    return [camera | {"width": 96 + 16 * n, "height": 64, "dist": np.zeros(5)} for n, camera in enumerate(rig)]
+    return [
+        camera | {"width": 96 + 16 * n, "height": 64, "dist": np.zeros(5)} for n, camera in enumerate(rig)
+    ]
 
 
 def test_videos_end_with_the_shortest(tmp_path):
@@ -218,7 +237,8 @@ def test_names_are_matched(names, paths):
 
 
 @pytest.mark.parametrize(
-    ("names", "paths"), [(["cam_01", "cam_02"], ["left.mp4", "right.mp4"]), (["a1", "b1"], ["x1.mp4", "y1.mp4"])]
+    ("names", "paths"),
+    [(["cam_01", "cam_02"], ["left.mp4", "right.mp4"]), (["a1", "b1"], ["x1.mp4", "y1.mp4"])],
 )
 def test_ambiguous_names_are_not_matched(names, paths):
     assert match_names(names, paths) is None
@@ -294,7 +314,9 @@ def test_middlebury_dino(shared, tmp_path):
     (tmp_path / "masks").symlink_to(source / "masks_derived")
     plain, read = open_capture(source), open_capture(tmp_path)
     torch.testing.assert_close(read.cameras.K, plain.cameras.K)
-    torch.testing.assert_close(read.cameras.camera_from_world, plain.cameras.camera_from_world, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        read.cameras.camera_from_world, plain.cameras.camera_from_world, rtol=0, atol=1e-6
+    )
     assert read.cameras.names == plain.cameras.names
     for kind in ("rgb", "mask"):
         assert torch.equal(getattr(read.read(0), kind), getattr(plain.read(0), kind))
@@ -305,7 +327,9 @@ def test_pose2sim_demo(shared):
     assert read.cameras.names == plain.cameras.names and len(read.frame_ids) == 100 and read.fps == 60
     assert torch.equal(read.cameras.size_px, plain.cameras.size_px)  # two videos are narrower than calibrated
     torch.testing.assert_close(read.cameras.K, plain.cameras.K, rtol=0, atol=1e-4)
-    torch.testing.assert_close(read.cameras.camera_from_world, plain.cameras.camera_from_world, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        read.cameras.camera_from_world, plain.cameras.camera_from_world, rtol=0, atol=1e-6
+    )
     assert torch.equal(read.read(3).rgb, plain.read(3).rgb)
 
 
@@ -376,7 +400,10 @@ INVALID_STORAGE = {
     "too large": (b" " * (MAX_BYTES + 1), "expected a.yml to have at most"),
     "too few numbers": (MATRIX.format(3, 3, "d", "1, 2").encode(), "K: expected rows x cols numbers, got 2"),
     "too many numbers": (MATRIX.format(1, 1, "d", "1, 2").encode(), "K: expected rows x cols numbers, got 2"),
-    "missing channels": (MATRIX.format(1, 2, "3u", "1, 2").encode(), "K: expected rows x cols numbers, got 2"),
+    "missing channels": (
+        MATRIX.format(1, 2, "3u", "1, 2").encode(),
+        "K: expected rows x cols numbers, got 2",
+    ),
     "words": (MATRIX.format(1, 2, "d", "1, two").encode(), "or invalid ones"),
     "no type": (MATRIX.format(1, 2, "[d]", "1, 2").encode(), "K: expected rows x cols"),
 }

@@ -11,7 +11,14 @@ import pytest
 
 from viewmend.data import images
 from viewmend.data.errors import CaptureError
-from viewmend.data.images import PNG_CHUNK_OVERHEAD, PNG_START, decode_image, read_mask, read_rgb, read_run_lengths
+from viewmend.data.images import (
+    PNG_CHUNK_OVERHEAD,
+    PNG_START,
+    decode_image,
+    read_mask,
+    read_rgb,
+    read_run_lengths,
+)
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 PNG = cv2.imencode(".png", IMAGE)[1].tobytes()
@@ -87,7 +94,9 @@ def test_a_malformed_file_costs_little_memory(tmp_path):
         "try: read_rgb(Path(sys.argv[1]), 'here')\nexcept ValueError: pass\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
     )
-    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.png"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.png"], capture_output=True, text=True, check=True
+    )
     assert int(done.stdout) < 100_000, "kilobytes"
 
 

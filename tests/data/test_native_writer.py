@@ -30,7 +30,9 @@ def assert_same(written, source, tolerance=0):
         a, b = written.read(time), source.read(time)
         assert a.cameras.names == b.cameras.names
         torch.testing.assert_close(a.cameras.K, b.cameras.K)
-        torch.testing.assert_close(a.cameras.camera_from_world, b.cameras.camera_from_world, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            a.cameras.camera_from_world, b.cameras.camera_from_world, atol=1e-6, rtol=0
+        )
         assert torch.equal(a.cameras.size_px, b.cameras.size_px)
         assert torch.equal(a.mask, b.mask)
         assert (a.rgb.float() - b.rgb.float()).abs().mean() <= tolerance
@@ -60,7 +62,9 @@ def test_jpeg_loses_little(plain, tmp_path):
 
 def test_depth_is_kept_to_half_a_millimetre(plain, tmp_path, rng):
     depth = 3 * torch.rand((4, 32, 40), generator=rng)
-    write_capture(Changed(open_capture(plain.path), lambda frame: replace(frame, depth=depth)), tmp_path / "copy")
+    write_capture(
+        Changed(open_capture(plain.path), lambda frame: replace(frame, depth=depth)), tmp_path / "copy"
+    )
     for time in (0, 1):
         assert (open_capture(tmp_path / "copy").read(time).depth - depth).abs().max() < 0.5001e-3
     far = Changed(open_capture(plain.path), lambda frame: replace(frame, depth=torch.full(depth.shape, 70.0)))
@@ -96,4 +100,9 @@ def test_camera_names_may_be_invalid_file_names(plain, tmp_path):
     source = open_capture(plain.path)
     write_capture(source, tmp_path / "copy", images="png")
     assert_same(open_capture(tmp_path / "copy"), source)
-    assert sorted(p.name for p in (tmp_path / "copy" / "image").iterdir()) == ["camera00", "camera01", "camera02", "ok"]
+    assert sorted(p.name for p in (tmp_path / "copy" / "image").iterdir()) == [
+        "camera00",
+        "camera01",
+        "camera02",
+        "ok",
+    ]

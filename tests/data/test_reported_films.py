@@ -14,7 +14,15 @@ from viewmend.data.videos import VideoFile, video_properties
 
 @pytest.mark.parametrize(
     ("transfer", "value", "expected"),
-    [(HLG, 0.75, 255), (HLG, 0.9, 255), (HLG, 0.0, 0), (HLG, 0.5, 153), (PQ, 0.5807, 255), (PQ, 0.0, 0), (1, 0.5, 128)],
+    [
+        (HLG, 0.75, 255),
+        (HLG, 0.9, 255),
+        (HLG, 0.0, 0),
+        (HLG, 0.5, 153),
+        (PQ, 0.5807, 255),
+        (PQ, 0.0, 0),
+        (1, 0.5, 128),
+    ],
 )
 @pytest.mark.parametrize("primaries", [1, BT2020, DISPLAY_P3])
 def test_grey_has_the_brightness_of_srgb(transfer, value, expected, primaries):
@@ -52,7 +60,9 @@ def write_interlaced(path, count=12):
         frame = np.full((SIZE[1], SIZE[0], 3), 60 + 12 * number, np.uint8)
         frame[1::2] += 6
         frames.append(frame)
-    return write_film(path, frames, options={"crf": "1", "x264-params": "tff=1", "flags": "+ildct+ilme"}, fps=15)
+    return write_film(
+        path, frames, options={"crf": "1", "x264-params": "tff=1", "flags": "+ildct+ilme"}, fps=15
+    )
 
 
 @pytest.mark.parametrize("order", [range(12), (7, 2, 11, 1)])
@@ -88,7 +98,9 @@ def test_films_are_matched_by_timecode():
     clock = match_tracks([clocked("a", 30, 100.0), clocked("b", 39, 99.7), clocked("b", 39, None, "masks")])
     assert clock.frames["b", "images"][0] - clock.frames["a", "images"][0] == 9
     assert (clock.frames["b", "masks"] == clock.frames["b", "images"]).all()
-    assert "0.30 s apart (first 'b', last 'a'); they are matched by timecode" in clock.issues(["a", "b"])[0].text
+    assert (
+        "0.30 s apart (first 'b', last 'a'); they are matched by timecode" in clock.issues(["a", "b"])[0].text
+    )
 
 
 def test_timecodes_over_midnight_fit_together():

@@ -33,7 +33,12 @@ def rig_of(count):
 
 
 def write_calibration(folder, rig, format):
-    writers = {EASYMOCAP: write_easymocap, QUALISYS: write_qualisys, POSE2SIM: write_toml, OPENCV: write_opencv}
+    writers = {
+        EASYMOCAP: write_easymocap,
+        QUALISYS: write_qualisys,
+        POSE2SIM: write_toml,
+        OPENCV: write_opencv,
+    }
     places = {QUALISYS: folder / "session.qca.txt", POSE2SIM: folder / "Calib.toml"}
     folder.mkdir(parents=True, exist_ok=True)
     style = {"style": "files"} if format == OPENCV else {}
@@ -51,7 +56,10 @@ def test_cameras_without_footage_are_left_out_and_named(tmp_path, caplog, format
     capture = open_capture(tmp_path)
     assert list(capture.cameras.names) == [camera["name"] for camera in rig[:3]]
     assert f"without footage are left out: {rig[3]['name']}, {rig[4]['name']}" in caplog.text
-    assert "no calibrated camera is not used: videos/witness.mp4" in caplog.text and "background" not in caplog.text
+    assert (
+        "no calibrated camera is not used: videos/witness.mp4" in caplog.text
+        and "background" not in caplog.text
+    )
 
 
 @pytest.mark.parametrize("names", ["{}/GX0{}0042.MP4", "{}_GX0{}0042.MP4"])
@@ -61,11 +69,15 @@ def test_several_films_of_a_camera_are_named(tmp_path, names):
     for camera in rig:
         for chapter in (1, 2):
             write_film(tmp_path / "videos" / names.format(camera["name"], chapter), [picture(chapter)])
-    with pytest.raises(CaptureError, match=r"expected one video of camera .*GX010042.*GX020042.*join the chapters"):
+    with pytest.raises(
+        CaptureError, match=r"expected one video of camera .*GX010042.*GX020042.*join the chapters"
+    ):
         open_capture(tmp_path)
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [("h264", "libx264"), ("264", "libx264"), ("mxf", "mpeg2video")])
+@pytest.mark.parametrize(
+    ("suffix", "codec"), [("h264", "libx264"), ("264", "libx264"), ("mxf", "mpeg2video")]
+)
 def test_films_of_other_recorders_are_opened(tmp_path, suffix, codec):
     rig = rig_of(3)
     write_calibration(tmp_path, rig, EASYMOCAP)
@@ -82,7 +94,9 @@ def test_films_of_an_unknown_kind_are_named(tmp_path):
     (tmp_path / "videos").mkdir()
     for camera in rig:
         (tmp_path / f"videos/{camera['name']}.braw").write_bytes(b"raw")
-    with pytest.raises(CaptureError, match=rf"unknown kind \(videos/{rig[0]['name']}.braw.*convert them to MP4"):
+    with pytest.raises(
+        CaptureError, match=rf"unknown kind \(videos/{rig[0]['name']}.braw.*convert them to MP4"
+    ):
         open_capture(tmp_path)
 
 
@@ -118,7 +132,9 @@ def several_times(rig, layout, shift=0.0):
         for camera in rig:
             path = layout.format(camera=camera["name"], time=time)
             t = camera["t"] + camera["R"] @ rng.uniform(-shift, shift, 3)
-            images.append(camera | {"name": path, "t": t, "image": f"images/{path}.png", "mask": f"masks/{path}.png"})
+            images.append(
+                camera | {"name": path, "t": t, "image": f"images/{path}.png", "mask": f"masks/{path}.png"}
+            )
     return images
 
 
@@ -139,7 +155,9 @@ def test_times_of_colmap_are_frames(tmp_path, layout, shift, binary):
     write_flat_images(tmp_path, images)
     write_colmap(tmp_path, opencv(images), binary=binary)
     capture = open_capture(tmp_path)
-    assert len(capture.cameras) == 4 and len(capture.frame_ids) == 3 and capture.has_masks and not capture.gaps
+    assert (
+        len(capture.cameras) == 4 and len(capture.frame_ids) == 3 and capture.has_masks and not capture.gaps
+    )
     found = dict(zip(capture.cameras.names, capture.cameras.centers.numpy(), strict=True))
     for camera in rig:
         (name,) = (name for name in found if camera["name"] in name)
@@ -154,7 +172,9 @@ def test_a_rig_of_colmap_that_moves_is_refused(tmp_path):
     assert len(open_capture(tmp_path).cameras) == 9
     lines = [f"{n} 1 1 0 0 0 0 0 0 3 CAMERA 1 {n} CAMERA 2 {n + 1} CAMERA 3 {n + 2}" for n in (1, 4, 7)]
     (tmp_path / "sparse/0/frames.txt").write_text("# Frame list\n" + "\n".join(lines))
-    with pytest.raises(CaptureError, match=r"got 3 frames of a rig, frames\.txt, .*write one model for each frame"):
+    with pytest.raises(
+        CaptureError, match=r"got 3 frames of a rig, frames\.txt, .*write one model for each frame"
+    ):
         open_capture(tmp_path)
 
 
@@ -240,5 +260,7 @@ def test_cameras_too_far_for_32_bits_are_refused():
     pose = cameras.camera_from_world.double()
     pose[:, :3, 3] -= pose[:, :3, :3] @ torch.tensor([4e5, 4.5e6, 200.0], dtype=torch.float64)
     far = replace(cameras, camera_from_world=pose.float())
-    with pytest.raises(ValueError, match=r"near the world's origin, got a rig of .* subtract the rig's centre"):
+    with pytest.raises(
+        ValueError, match=r"near the world's origin, got a rig of .* subtract the rig's centre"
+    ):
         far.check()

@@ -57,14 +57,20 @@ def test_a_slower_camera_is_absent_in_between(rate):
 
 def test_one_fast_camera_does_not_set_the_pace():
     clock = match_tracks(tracks(a=(range(48), 120), b=range(12), c=range(12)))
-    assert clock.frames["a", "images"].tolist() == list(range(0, 48, 4)) and clock.fps == 30.0 and not said(clock)
+    assert (
+        clock.frames["a", "images"].tolist() == list(range(0, 48, 4))
+        and clock.fps == 30.0
+        and not said(clock)
+    )
 
 
 def test_half_of_the_cameras_being_slow_is_said():
     fast, slow = range(24), (range(12), 15)
     clock = match_tracks(tracks(a=fast, b=fast, c=slow, d=slow))
     assert clock.fps == 15.0 and clock.frames["a", "images"].tolist() == list(range(0, 24, 2))
-    assert ["cameras 'a', 'b' have 30 frames per second, not the others' 15" in text for text in said(clock)] == [True]
+    assert [
+        "cameras 'a', 'b' have 30 frames per second, not the others' 15" in text for text in said(clock)
+    ] == [True]
 
 
 def test_variable_rates_and_drift_do_not_lose_frames():
@@ -117,7 +123,9 @@ def darkness(frame, camera):
     """Which time a camera of the capture shows: from time to time the ball grows darker by a tenth."""
     images = dict(zip(frame.cameras.names, frame.rgb.float(), strict=True))
     bright = photograph(ring(4)).rgb.float()
-    return round(10 * (1 - float(images[camera].amax((1, 2)).sum() / bright[NAMES.index(camera)].amax((1, 2)).sum())))
+    return round(
+        10 * (1 - float(images[camera].amax((1, 2)).sum() / bright[NAMES.index(camera)].amax((1, 2)).sum()))
+    )
 
 
 @pytest.fixture

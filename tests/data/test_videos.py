@@ -60,7 +60,9 @@ def test_display_matrices_are_obeyed(tmp_path, name):
 
 def test_an_edit_list_hides_frames(tmp_path):
     dark = [np.zeros_like(FRAMES[0])] * 6
-    video = video_properties(write_film(tmp_path / "a.mp4", dark + FRAMES, hidden=6, options={"g": "250", "bf": "0"}))
+    video = video_properties(
+        write_film(tmp_path / "a.mp4", dark + FRAMES, hidden=6, options={"g": "250", "bf": "0"})
+    )
     assert video.frames == 12 and video.times_s[0] == pytest.approx(0, abs=1e-3)
     shown = [to_rgb(frame) for _, frame in decode(video)]
     assert len(shown) == 12 and np.abs(shown[0].astype(int) - FRAMES[0]).mean() < 12

@@ -19,7 +19,10 @@ def cells(make_cell, make_frame, rng):
 
     def frame(hole_px: int):
         inside = hole_px // 2
-        scores = {"psnr_holes": number(30) if hole_px else None, "psnr_holes_fg": number(30) if inside else None}
+        scores = {
+            "psnr_holes": number(30) if hole_px else None,
+            "psnr_holes_fg": number(30) if inside else None,
+        }
         return make_frame(hole_px=hole_px, hole_fg_px=inside, psnr_whole=number(30), **scores)
 
     found = []
@@ -54,14 +57,24 @@ def test_tables_are_means_of_frames_then_scenes_then_sets(cells):
             ("psnr_whole", 0, "hole_px"),
         ):
             expected = [reference_mean(own, method, score, enough, pixels) for own in sets]
-            assert [table.rows[n].scores.mean(*score.split("_", 1)) for table in per_set] == pytest.approx(expected)
-            assert overall.rows[n].scores.mean(*score.split("_", 1)) == pytest.approx(statistics.fmean(expected))
+            assert [table.rows[n].scores.mean(*score.split("_", 1)) for table in per_set] == pytest.approx(
+                expected
+            )
+            assert overall.rows[n].scores.mean(*score.split("_", 1)) == pytest.approx(
+                statistics.fmean(expected)
+            )
 
 
 def test_gain_is_over_the_scenes_that_both_methods_have(make_cell, make_frame):
     scores = {"a": (20.0, 21.0), "b": (22.0, 20.0), "c": (24.0, 21.0), "d": (30.0, None)}
     made = [
-        make_cell(scene, method, "A", [] if psnr is None else [make_frame(psnr_holes=psnr)], None if psnr else "broke")
+        make_cell(
+            scene,
+            method,
+            "A",
+            [] if psnr is None else [make_frame(psnr_holes=psnr)],
+            None if psnr else "broke",
+        )
         for scene, both in scores.items()
         for method, psnr in zip(METHODS, both, strict=True)
     ]

@@ -30,7 +30,11 @@ TABLE_3 = ["single-camera-no-masks", "single-camera", "no-past", "no-rope", "ful
 
 def test_rows_are_the_papers():
     methods = [[row.method for row in paper_rows(table)] for table in (1, 2, 3)]
-    assert methods == [["rgvi", *BASELINES, OURS], ["dstt-o-mul", "fuseformer-o-mul", "e2fgvi-o-mul", OURS], TABLE_3]
+    assert methods == [
+        ["rgvi", *BASELINES, OURS],
+        ["dstt-o-mul", "fuseformer-o-mul", "e2fgvi-o-mul", OURS],
+        TABLE_3,
+    ]
 
 
 def test_our_figures_are_means_over_seeds(make_cell, make_frame):
@@ -38,11 +42,19 @@ def test_our_figures_are_means_over_seeds(make_cell, make_frame):
     cells = [make_cell("s", name, "P", [make_frame(psnr_holes=value)]) for name, value in frames.items()]
     cells.append(make_cell("s", "broken", "P", [], "no"))
     report = make_report(cells, (*frames, "broken", "missing"), RunSettings(), {"missing": "no weights"})
-    methods = {"full": ("full-s0", "full-s1"), "no-rope": ("no-rope",), "no-past": (), "single-camera": ("broken",)}
+    methods = {
+        "full": ("full-s0", "full-s1"),
+        "no-rope": ("no-rope",),
+        "no-past": (),
+        "single-camera": ("broken",),
+    }
     grid = paper_grid([*paper_rows(3), PaperRow("not in the paper", "no-rope")], report, methods)
     lines = [dict(zip(grid.heads, row, strict=True)) for row in grid.rows]
     _, single, no_past, no_rope, full, other = lines
-    assert (full["PSNR holes (a) (here)"], full["PSNR inpainted, reading (b) (paper)"]) == ("21.000", "42.184")
+    assert (full["PSNR holes (a) (here)"], full["PSNR inpainted, reading (b) (paper)"]) == (
+        "21.000",
+        "42.184",
+    )
     assert (no_rope["PSNR holes (a) (here)"], no_rope["PSNR (paper)"]) == ("19.000", "32.046")
     assert no_past["PSNR (here)"] == "n/a" and no_past["here"] == "none" and no_past["FPS (paper)"] == "41.32"
     assert single["PSNR (here)"] == "n/a" and "**1 failed**" in single["here"]
@@ -51,9 +63,19 @@ def test_our_figures_are_means_over_seeds(make_cell, make_frame):
 
 
 def test_models_of_the_ablation_are_found_by_name(tmp_path):
-    for name in ("full-s0", "full-s1", "no-rope", "single-camera", "single-camera-no-masks-s0", "full-old", "other"):
+    for name in (
+        "full-s0",
+        "full-s1",
+        "no-rope",
+        "single-camera",
+        "single-camera-no-masks-s0",
+        "full-old",
+        "other",
+    ):
         (tmp_path / name).mkdir()
-    found = {name: [path.rpartition("/")[2] for path in paths] for name, paths in ablation_models(tmp_path).items()}
+    found = {
+        name: [path.rpartition("/")[2] for path in paths] for name, paths in ablation_models(tmp_path).items()
+    }
     assert found == {
         "single-camera-no-masks": ["single-camera-no-masks-s0"], "single-camera": ["single-camera"], "no-past": [],
         "no-rope": ["no-rope"], "full": ["full-s0", "full-s1"],
@@ -70,7 +92,9 @@ def test_the_command_writes_the_table_in_every_format(tmp_path, capsys):
     assert len(lines) == 25 and lines[19]["here"] == "none" and lines[1]["PSNR (here)"] == "n/a"
     assert (lines[20]["row"], lines[20]["here"]) == ("not in the paper", "nearest")
     assert "Here: 1 scenes, 1 frames of 128 x 128; holes" in text
-    assert lines[0]["PSNR (here)"] == "n/a" and lines[0]["PSNR (paper)"] == "33.478", "RGVI needs its networks"
+    assert lines[0]["PSNR (here)"] == "n/a" and lines[0]["PSNR (paper)"] == "33.478", (
+        "RGVI needs its networks"
+    )
     assert float(lines[20]["PSNR (here)"]) > 10 and 0 < float(lines[20]["LPIPS (here)"]) < 1
     with (tmp_path / "table1.csv").open() as file:
         assert list(csv.DictReader(file)) == lines
@@ -107,5 +131,7 @@ def test_a_network_trained_from_scratch_is_not_called_fine_tuned(tmp_path, monke
         ("random weights", "DSTT, trained from scratch (81 minutes), def"),
         ("`dstt.pth`", "DSTT finetuned, def"),
     ):
-        (folder / "README.md").write_text(f"Trained by `viewmend train dstt` from {start}: 9 steps in 81 minutes.")
+        (folder / "README.md").write_text(
+            f"Trained by `viewmend train dstt` from {start}: 9 steps in 81 minutes."
+        )
         assert paper_table._relabelled(row, None).label == label

@@ -75,7 +75,9 @@ def test_a_predicted_mask_cuts_the_view_and_the_truth_is_not_looked_at():
     assert torch.equal(step.completed.opacity, step.completed.view.mask * used)
     assert not step.completed.rgb[:, used == 0].any()
     emptied = replace(truth, mask=truth.mask * 0)
-    again = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject()).mend(frame, TARGET, emptied)
+    again = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject()).mend(
+        frame, TARGET, emptied
+    )
     assert torch.equal(again.completed.rgb, step.completed.rgb)
     assert revealed("predicted-mask", truth) == (None, None)
 
@@ -96,7 +98,9 @@ def test_classical_fills_see_the_uncut_view_and_are_cut_afterwards():
             return super().step(view, context, state)
 
     cut = mended("target-mask", Spy())
-    assert torch.equal(seen[-1].rgb, cut.completed.view.rgb) and seen[-1].rgb[:, seen[-1].target_mask == 0].any()
+    assert (
+        torch.equal(seen[-1].rgb, cut.completed.view.rgb) and seen[-1].rgb[:, seen[-1].target_mask == 0].any()
+    )
 
 
 def test_outside_of_the_target_mask_there_is_neither_confidence_nor_depth():
@@ -146,7 +150,9 @@ def test_what_the_target_mask_shows_is_opaque():
     made = opaque_in_mask(completed)
     known = (mask > 0) & (error > 0)
     assert (made.alpha[known] == 1).all() and torch.equal(made.alpha[~known], alpha[~known])
-    torch.testing.assert_close(made.rgb[:, known], colour[:, 0].expand(3, int(known.sum())), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        made.rgb[:, known], colour[:, 0].expand(3, int(known.sum())), atol=1e-3, rtol=0
+    )
     assert torch.equal(made.rgb[:, ~known], completed.rgb[:, ~known])
     without = CompletedView(replace(given, target_mask=None), completed.rgb, alpha=alpha)
     assert opaque_in_mask(without) is without
@@ -162,7 +168,9 @@ def test_without_masks_nothing_is_cut_and_no_patch_is_dropped():
     frame = replace(views.frame, mask=torch.zeros_like(views.frame.mask))
     made = build_context_input(replace(views, frame=frame), config)
     assert torch.equal(made.channels[:, :3], views.frame.rgb.float() / 255) and bool(made.kept.all())
-    given = replace(incomplete, mask=torch.zeros_like(incomplete.mask), target_mask=torch.zeros_like(incomplete.mask))
+    given = replace(
+        incomplete, mask=torch.zeros_like(incomplete.mask), target_mask=torch.zeros_like(incomplete.mask)
+    )
     target = build_target_input(given, config)
     assert torch.equal(target.channels[0, :3], incomplete.rgb) and bool(target.kept.all())
     assert made.channels.shape[1] == 4, "RGB and depth"
@@ -174,7 +182,10 @@ def test_a_target_mask_that_overshoots_is_clamped():
     mask = torch.ones(stream.render(TARGET).mask.shape)
     mask[:, 20:24], mask[:, 24:28] = 1.2, -0.2
     exact = stream.view(TARGET, target_mask=mask.clamp(0, 1)).completed
-    for own in (stream.view(TARGET, target_mask=mask), stream.mend(replace(stream.render(TARGET), target_mask=mask))):
+    for own in (
+        stream.view(TARGET, target_mask=mask),
+        stream.mend(replace(stream.render(TARGET), target_mask=mask)),
+    ):
         assert torch.equal(own.completed.rgb, exact.rgb) and torch.equal(own.completed.opacity, exact.opacity)
 
 
@@ -228,9 +239,13 @@ def test_views_are_selected_by_angle_or_by_direction():
     by_angle = select_closest(target, cameras, centre, 3)
     pose = cameras.camera_from_world.clone()
     first = cameras.names.index(by_angle[0])
-    pose[first] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ pose[first]  # the closest camera looks away
+    pose[first] = (
+        torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ pose[first]
+    )  # the closest camera looks away
     away = replace(cameras, camera_from_world=pose)
     assert select_closest(target, away, centre, 7) == select_closest(target, cameras, centre, 7)
     assert select_closest(target, away, centre, 7, "direction")[-1] == by_angle[0]
-    with pytest.raises(ValueError, match="expected a selection of views by 'angle' or 'direction', got 'colour'"):
+    with pytest.raises(
+        ValueError, match="expected a selection of views by 'angle' or 'direction', got 'colour'"
+    ):
         RenderConfig(selection="colour")

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from viewmend.data.images import read_rgb
-from viewmend.evaluation.report import blocks, main_grid, make_report, markdown, report_csv, report_json, summary
+from viewmend.evaluation.report import (
+    blocks,
+    main_grid,
+    make_report,
+    markdown,
+    report_csv,
+    report_json,
+    summary,
+)
 from viewmend.evaluation.report_page import largest_hole, page, write_sheets
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
@@ -44,7 +52,9 @@ def test_every_format_has_the_same_figures(evaluated):
         assert own == {name: number for name, number in cell.items() if name in own}
         assert ("psnr_holes" in own) == (cell["error"] is None) and "lpips_alex_whole" not in own
         if own:
-            assert f"{own['psnr_holes']:.2f}" in text and f"{own['ssim_holes']:.5f}" in text and cell["fps"] > 0
+            assert (
+                f"{own['psnr_holes']:.2f}" in text and f"{own['ssim_holes']:.5f}" in text and cell["fps"] > 0
+            )
     assert len(value["cells"]) == 4 and {line["method"] for line in lines} == {"telea", "unfilled"}
     assert [value["cells"][0]["psnr_holes"]] == [np.mean([f.psnr_holes for f in cells[0].frames])]
     rows = {row["method"]: row["scores"]["psnr_holes"] for row in value["tables"][1]["rows"][:2]}
@@ -71,10 +81,16 @@ def test_failures_and_missing_methods_are_in_every_format(evaluated):
 
 def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame):
     def cells(method, scores):
-        frames = [make_frame(psnr_holes=score, psnr_whole=30.0, lpips_alex_whole=1 / score) for score in scores]
+        frames = [
+            make_frame(psnr_holes=score, psnr_whole=30.0, lpips_alex_whole=1 / score) for score in scores
+        ]
         return [make_cell(f"s{n}", method, "A", [frame]) for n, frame in enumerate(frames)]
 
-    found = [*cells("telea", (20.0, 22.0, 24.0)), *cells("views", (25.0, 25.0, 26.5)), *cells("rgvi", (30.0,) * 3)]
+    found = [
+        *cells("telea", (20.0, 22.0, 24.0)),
+        *cells("views", (25.0, 25.0, 26.5)),
+        *cells("rgvi", (30.0,) * 3),
+    ]
     report = make_report(found, ("telea", "views", "rgvi"), RunSettings())
     grid = main_grid(report.tables[0])
     assert {"holes, dB", "whole, dB"} <= set(grid.heads)

@@ -100,7 +100,10 @@ def test_a_damaged_cell_is_computed_again(whole, small_scenes, copied):
         path.write_text(damage)
         assert store.load(key) is None
     assert scores(run(small_scenes, copied)) == scores(whole[1])
-    assert json.loads(path.read_text())["frames"][0]["psnr_whole"] == whole[1]["s1", "telea"].frames[0].psnr_whole
+    assert (
+        json.loads(path.read_text())["frames"][0]["psnr_whole"]
+        == whole[1]["s1", "telea"].frames[0].psnr_whole
+    )
 
 
 def test_damaged_images_are_ignored(whole, copied):
@@ -128,11 +131,15 @@ class ChangesEverything(Telea):
 def in_place_of_telea(inpainter):
     make = scene_run.make_method
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "make_method", lambda name, *how: inpainter() if name == "telea" else make(name, *how))
+        patch.setattr(
+            scene_run, "make_method", lambda name, *how: inpainter() if name == "telea" else make(name, *how)
+        )
         yield
 
 
-@pytest.mark.parametrize(("inpainter", "message"), [(FailsLater, "no more"), (ChangesEverything, "pixels with E = 0")])
+@pytest.mark.parametrize(
+    ("inpainter", "message"), [(FailsLater, "no more"), (ChangesEverything, "pixels with E = 0")]
+)
 def test_a_failed_cell_is_reported_and_tried_again(small_scenes, tmp_path, whole, inpainter, message):
     with in_place_of_telea(inpainter):
         cells = run(small_scenes[:1], tmp_path)
@@ -166,7 +173,9 @@ def test_workers_exit_when_their_parent_is_killed():
         "import os; from viewmend.evaluation.runner import process_pool; pool = process_pool(1, 1); "
         "print(pool.submit(os.getpid).result(), flush=True); input()"
     )
-    with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as parent:
         assert parent.stdout is not None
         worker = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()

@@ -68,7 +68,9 @@ def test_a_scene_without_frames_fails(turning):
 
 def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_frames():
     short, long = procedural_set(), lengthened(procedural_set())
-    assert [s.name for s in long[:2]] == ["P-long-10000", "P-long-10001"] and {s.set for s in long} == {"P-long"}
+    assert [s.name for s in long[:2]] == ["P-long-10000", "P-long-10001"] and {s.set for s in long} == {
+        "P-long"
+    }
     for one, other in zip(short, long, strict=True):
         assert replace(other.config, frames=one.config.frames) == one.config and other.held == one.held
         assert len(window_times(other.scored_from, paper_small())) == 7

@@ -63,12 +63,16 @@ def test_scores_match_hand_computed_values(case):
     squared = (0.01 + 0.81) / 2
     assert scores.psnr_holes == pytest.approx(decibel(squared), abs=1e-4)
     assert scores.psnr_holes_fg == pytest.approx(20, abs=1e-4)
-    assert scores.psnr_masked == pytest.approx(decibel(squared * 100 / 2000), abs=1e-4)  # the hole's share lifts it
+    assert scores.psnr_masked == pytest.approx(
+        decibel(squared * 100 / 2000), abs=1e-4
+    )  # the hole's share lifts it
     assert scores.psnr_whole == pytest.approx(scores.psnr_masked)
     assert scores.psnr_valid == 100
     assert scores.psnr_whole_rendered == pytest.approx(decibel(50 * 0.25 / 2000), abs=1e-4)
     assert scores.psnr_subject == pytest.approx(decibel(50 * 0.01 / 1950), abs=1e-4)
-    assert scores.alpha_iou == scores.hull_iou == pytest.approx(1950 / 2000), "M stands in for a missing alpha"
+    assert scores.alpha_iou == scores.hull_iou == pytest.approx(1950 / 2000), (
+        "M stands in for a missing alpha"
+    )
     assert scores.flicker is scores.change_still is scores.lpips_alex_whole is None
     completed, truth = case
     alpha = torch.where(truth.mask, 0.51, 0.49)
@@ -109,7 +113,9 @@ def test_scores_of_networks_are_read_from_their_maps(case):
     scores = score_view(*case, Scorers(ssim=None, lpips_alex=score, lpips_vgg=lambda image, truth: None))
     assert scores.lpips_alex_holes == pytest.approx(0.5)
     assert scores.lpips_alex_holes_fg == pytest.approx(0.1)
-    assert scores.lpips_alex_whole == pytest.approx(scores.lpips_alex_masked) == pytest.approx(0.5 * 100 / 2000)
+    assert (
+        scores.lpips_alex_whole == pytest.approx(scores.lpips_alex_masked) == pytest.approx(0.5 * 100 / 2000)
+    )
     assert scores.lpips_vgg_whole is scores.lpips_vgg_holes is scores.ssim_whole is None
 
 
@@ -138,7 +144,9 @@ def test_flicker_is_error_that_does_not_move_with_the_surface(case, moving):
     outside = now.clone()
     outside[:, ~case[0].view.holes] += 0.1
     assert temporal(case, moving, before, outside).flicker == pytest.approx(0, abs=1e-6)
-    assert 0.08 < temporal(case, moving, before, outside).flicker_whole < 0.1, "over everything, holes included"
+    assert 0.08 < temporal(case, moving, before, outside).flicker_whole < 0.1, (
+        "over everything, holes included"
+    )
     assert temporal(case, moving, before, before).flicker > 0.1
 
 
@@ -218,13 +226,19 @@ def test_cells_store_features_and_tables_have_vfid(networks, small_scenes, tmp_p
         return sorted((cell for found in steps for cell in found), key=lambda c: (c.key.scene, c.key.method))
 
     cells, again = run(), run()
-    assert all(frame.lpips_alex_holes > 0 and frame.lpips_vgg_holes is None for c in cells for frame in c.frames)
+    assert all(
+        frame.lpips_alex_holes > 0 and frame.lpips_vgg_holes is None for c in cells for frame in c.frames
+    )
     for first, second in zip(cells, again, strict=True):
         assert all((first.features[kind] == second.features[kind]).all() for kind in KINDS)
         assert all((first.true_features[kind] == second.true_features[kind]).all() for kind in KINDS)
     (table,) = tables(again, methods)
     own = [c for c in cells if c.key.method == "telea"]
-    sides = [torch.from_numpy(getattr(c, name)["whole_eval"]) for name in ("features", "true_features") for c in own]
+    sides = [
+        torch.from_numpy(getattr(c, name)["whole_eval"])
+        for name in ("features", "true_features")
+        for c in own
+    ]
     expected = frechet_distance(torch.cat(sides[:2]), torch.cat(sides[2:]))
     assert table.rows[0].vfid["whole_eval"] == pytest.approx(expected) and expected > 0
     shown = dict(zip(main_grid(table).heads, main_grid(table).rows[0], strict=True))

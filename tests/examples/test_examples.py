@@ -83,7 +83,18 @@ def test_views_of_another_renderer_are_completed(tmp_path):
 def test_a_method_in_one_short_file_is_evaluated(tmp_path):
     name = f"{ROOT / 'examples/03_own_method.py'}:Afterimage"
     assert isinstance(make_method(name), Inpainter)
-    arguments = ["evaluate", "P", "--scenes", "1", "--frames", "2", "--size", "128", "--methods", f"unfilled,{name}"]
+    arguments = [
+        "evaluate",
+        "P",
+        "--scenes",
+        "1",
+        "--frames",
+        "2",
+        "--size",
+        "128",
+        "--methods",
+        f"unfilled,{name}",
+    ]
     assert cli.main([*arguments, "--out", str(tmp_path)]) == 0
     unfilled, own = json.loads((tmp_path / "report.json").read_text())["cells"]
     assert own["method"] == name and own["error"] is None and own["frames"] == 2
@@ -115,7 +126,18 @@ def test_masks_are_nearly_the_true_ones(tmp_path):
 
 @pytest.mark.slow
 def test_a_fine_tuned_model_is_compared(takes, tmp_path):
-    options = ("--steps", "1", "--batch", "1", "--workers", "0", "--sizes-px", "96", "--num-holdout-views", "1")
+    options = (
+        "--steps",
+        "1",
+        "--batch",
+        "1",
+        "--workers",
+        "0",
+        "--sizes-px",
+        "96",
+        "--num-holdout-views",
+        "1",
+    )
     before, after = example(8)["main"](takes / "ada", tmp_path / "out", *options)
     assert before > 15
     assert after == pytest.approx(before, abs=1), "one step changes little"

@@ -50,7 +50,9 @@ def mutated_json(draw, value):
             many = 1 if copies > 1 else many  # repeating lists of repeated lists would take all memory
         else:
             parent[key] = (
-                copy.deepcopy(draw(VALUES)) if kind != "deep" else nested(draw(st.sampled_from([3, 900, 5000])))
+                copy.deepcopy(draw(VALUES))
+                if kind != "deep"
+                else nested(draw(st.sampled_from([3, 900, 5000])))
             )
     return value
 
@@ -107,7 +109,9 @@ def mutated_words(draw, text: str):
     return " ".join(words).encode()
 
 
-def fuzz(inputs, read: Callable[[bytes], object], refusals: tuple[type[Exception], ...] = (ValueError,)) -> None:
+def fuzz(
+    inputs, read: Callable[[bytes], object], refusals: tuple[type[Exception], ...] = (ValueError,)
+) -> None:
     """Check that each input is read or rejected with a short message, in limited time and memory."""
     numbers = itertools.count()
 

@@ -64,8 +64,19 @@ def test_calibrations_of_other_tools(name, tmp_path):
         (tmp_path / "images" / camera).mkdir(parents=True)
         for image in (f"images/{camera}.png", f"images/{camera}/0.png"):
             cv2.imwrite(str(tmp_path / image), np.zeros((20, 30, 3), np.uint8))
-        entry = {"name": camera, "width": 30, "height": 20, "K": np.diag([40.0, 40.0, 1.0]), "dist": np.zeros(5)}
-        entry |= {"R": np.eye(3), "t": np.full(3, float(camera[3:])), "image": f"images/{camera}.png", "mask": None}
+        entry = {
+            "name": camera,
+            "width": 30,
+            "height": 20,
+            "K": np.diag([40.0, 40.0, 1.0]),
+            "dist": np.zeros(5),
+        }
+        entry |= {
+            "R": np.eye(3),
+            "t": np.full(3, float(camera[3:])),
+            "image": f"images/{camera}.png",
+            "mask": None,
+        }
         cameras.append(entry)
     WRITERS[name](tmp_path, cameras)
     places = (tmp_path / "sparse" / "0", tmp_path / "cam1", tmp_path)
@@ -124,7 +135,9 @@ def test_models(tmp_path):
     save_inpainter(tiny(), tmp_path, "# A card")
     fuzz_file(tmp_path / "config.json", lambda: load_network(tmp_path))
     weights = (tmp_path / "model.safetensors").read_bytes()
-    heads = mutated_bytes(weights[:4000]).map(lambda head: head + weights[4000:])  # hypothesis keeps what it draws
+    heads = mutated_bytes(weights[:4000]).map(
+        lambda head: head + weights[4000:]
+    )  # hypothesis keeps what it draws
     fuzz_file(tmp_path / "model.safetensors", lambda: load_network(tmp_path), heads)
 
 
@@ -137,12 +150,18 @@ def test_gltf(tmp_path):
     def pack(value):
         text = to_json(value)
         text += b" " * (-len(text) % 4)
-        return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+        return (
+            struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+            + text
+            + rest
+        )
 
     fuzz_file(file, lambda: load_character(file), mutated_json(document).map(pack) | mutated_bytes(good))
 
 
-@pytest.mark.parametrize("uri", ["/etc/passwd", "../secret", "%2e%2e/secret", "/dev/zero", "link.bin", "folder"])
+@pytest.mark.parametrize(
+    "uri", ["/etc/passwd", "../secret", "%2e%2e/secret", "/dev/zero", "link.bin", "folder"]
+)
 def test_gltf_reads_only_its_own_folder(uri, tmp_path):
     (tmp_path / "secret").write_bytes(b"\0" * 100)
     (tmp_path / "in" / "folder").mkdir(parents=True)
@@ -155,7 +174,9 @@ def test_gltf_reads_only_its_own_folder(uri, tmp_path):
 
 def test_bvh(tmp_path):
     file = write_motion(tmp_path / "a.bvh")
-    fuzz_file(file, lambda: read_bvh(file), mutated_words(file.read_text()) | mutated_bytes(file.read_bytes()))
+    fuzz_file(
+        file, lambda: read_bvh(file), mutated_words(file.read_text()) | mutated_bytes(file.read_bytes())
+    )
     file.write_text("HIERARCHY ROOT a { CHANNELS 0 } MOTION\nFrames: 999999999999\nFrame Time: 0.1\n")
     with pytest.raises(ValueError, match="expected 999999999999 frames of 0 finite numbers"):
         read_bvh(file)
@@ -177,7 +198,9 @@ def test_live_messages():
     def parse_look(data):
         understood = parse(data.decode(errors="replace"), Limits())
         if isinstance(understood, Look):
-            assert understood.width * understood.height <= Limits().max_pixels and len(understood.cameras) in (1, 2)
+            assert understood.width * understood.height <= Limits().max_pixels and len(
+                understood.cameras
+            ) in (1, 2)
             assert all(math.isfinite(v) for eye in understood.cameras for v in (eye.azimuth, *(eye.R or ())))
 
     fuzz(mutated_json(look).map(to_json), parse_look)

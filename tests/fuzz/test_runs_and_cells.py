@@ -59,12 +59,16 @@ def test_logs(tmp_path):
 
 
 def to_lines(values: object) -> bytes:
-    return b"".join(to_json(value) + b"\n" for value in values) if isinstance(values, list) else to_json(values)
+    return (
+        b"".join(to_json(value) + b"\n" for value in values) if isinstance(values, list) else to_json(values)
+    )
 
 
 def cell() -> Cell:
     names = ViewScores.__dataclass_fields__
-    frame = ViewScores(**{n: 1 if n in ("time", "width_px", "height_px") or n.endswith("_px") else 0.5 for n in names})
+    frame = ViewScores(
+        **{n: 1 if n in ("time", "width_px", "height_px") or n.endswith("_px") else 0.5 for n in names}
+    )
     return Cell(CellKey("s", "m", "d", "e"), "P", "ring", "calm", "x", (frame,), (1.0,), None, ORIGIN)
 
 
@@ -74,7 +78,9 @@ def test_features_with_a_truncated_header_are_ignored(tmp_path):
     head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, 1024, \n"
     with zipfile.ZipFile(tmp_path / f"{cell().key.stem}.npz", "w") as packed:
         for kind in KINDS:
-            packed.writestr(f"{kind}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(4096))
+            packed.writestr(
+                f"{kind}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(4096)
+            )
     assert store.load(cell().key).features is None
 
 

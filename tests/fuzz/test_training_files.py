@@ -8,7 +8,17 @@ from random import Random
 
 import pytest
 import torch
-from fuzz.inputs import File, fuzz, fuzz_file, join_tensors, mutated_bytes, mutated_json, nested, split_tensors, to_json
+from fuzz.inputs import (
+    File,
+    fuzz,
+    fuzz_file,
+    join_tensors,
+    mutated_bytes,
+    mutated_json,
+    nested,
+    split_tensors,
+    to_json,
+)
 from jaxtyping import UInt8
 from safetensors.torch import save
 from torch import Tensor
@@ -52,11 +62,16 @@ def with_structure(data: bytes, structure: object) -> bytes:
     begin, end = head[STRUCTURE]["data_offsets"]
     rest = {name: entry for name, entry in head.items() if name != STRUCTURE}
     moved = {
-        name: entry | {"data_offsets": [at - (end - begin if at >= end else 0) for at in entry["data_offsets"]]}
+        name: entry
+        | {"data_offsets": [at - (end - begin if at >= end else 0) for at in entry["data_offsets"]]}
         for name, entry in rest.items()
     }
     tensors = tensors[:begin] + tensors[end:]
-    moved[STRUCTURE] = {"dtype": "U8", "shape": [len(text)], "data_offsets": [len(tensors), len(tensors) + len(text)]}
+    moved[STRUCTURE] = {
+        "dtype": "U8",
+        "shape": [len(text)],
+        "data_offsets": [len(tensors), len(tensors) + len(text)],
+    }
     return join_tensors(moved, tensors + text)
 
 
@@ -78,7 +93,9 @@ def test_samples_in_files(kind, request):
         if isinstance(found, StoredScene):
             found.sample(0, RenderConfig(), 2)
 
-    inputs = mutated_json(structure).map(lambda other: with_structure(good, other)) | mutated_bytes(good).map(File)
+    inputs = mutated_json(structure).map(lambda other: with_structure(good, other)) | mutated_bytes(good).map(
+        File
+    )
     fuzz(inputs | mutated_json(head).map(lambda other: join_tensors(other, tensors)), read)
 
 

@@ -24,7 +24,11 @@ def dome(count: int, distance: float = 2.5, **options) -> Cameras:
     cameras = []
     for i in range(count):
         angle = 2 * math.pi * i / count
-        eye = (distance * math.cos(angle), (0.8, -0.3, 0.2)[i % 3] * distance / 2.5, distance * math.sin(angle))
+        eye = (
+            distance * math.cos(angle),
+            (0.8, -0.3, 0.2)[i % 3] * distance / 2.5,
+            distance * math.sin(angle),
+        )
         cameras.append(camera_at(eye, name=f"c{i}", **options))
     return concatenate_cameras(cameras)
 

@@ -47,7 +47,9 @@ def test_cropping_moves_the_origin():
     camera = camera_at((2.0, 0.0, 0.0))
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     window = camera.cropped(10, -5, 20, 16)
-    torch.testing.assert_close(project(points, window)[0], project(points, camera)[0] - torch.tensor([10.0, -5.0]))
+    torch.testing.assert_close(
+        project(points, window)[0], project(points, camera)[0] - torch.tensor([10.0, -5.0])
+    )
     assert window.max_size_px == (20, 16)
 
 
@@ -61,7 +63,10 @@ def test_selection_by_name_and_by_position():
 
 
 def test_pixel_centers_start_at_a_half():
-    assert pixel_centers(3, 2).tolist() == [[[0.5, 0.5], [1.5, 0.5], [2.5, 0.5]], [[0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]]
+    assert pixel_centers(3, 2).tolist() == [
+        [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5]],
+        [[0.5, 1.5], [1.5, 1.5], [2.5, 1.5]],
+    ]
 
 
 # Rigid motions.
@@ -104,7 +109,9 @@ def test_an_axis_angle_keeps_its_axis_and_turns_by_its_angle(axis, angle):
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     rotation = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))
-    torch.testing.assert_close(rotation @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        rotation @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0
+    )
 
 
 def test_rotations_are_told_from_other_matrices():

@@ -38,7 +38,9 @@ def bowl(points):
 def proxy_of(inside) -> GeometryProxy:
     """The surface of a solid, from a fine grid."""
     cubes = Cubes.of(BOX, 128)
-    values = (0.5 + inside(cubes.centers(torch.device("cpu"))) / cubes.side_m / 2).clamp(0, 1).view(cubes.shape)
+    values = (
+        (0.5 + inside(cubes.centers(torch.device("cpu"))) / cubes.side_m / 2).clamp(0, 1).view(cubes.shape)
+    )
     mesh = extract_surface(OccupancyGrid(values, cubes.low, cubes.side_m))
     return GeometryProxy(mesh, vertex_normals(mesh), BOX)
 
@@ -57,7 +59,9 @@ def carved(proxy, cameras, views, config=CONFIG):
 
 def test_both_paths_equal_the_slow_reference(fuse, rng):
     proxy = proxy_of(bowl)
-    cameras = concatenate_cameras([*(ring(3, 40)[[n]] for n in range(3)), ABOVE[[0]], camera_at(10, "near", 30)])
+    cameras = concatenate_cameras(
+        [*(ring(3, 40)[[n]] for n in range(3)), ABOVE[[0]], camera_at(10, "near", 30)]
+    )
     mask = (255 * (proxy.depth(cameras) > 0)).byte()
     config = FusionConfig(resolution=14, confidence_power=1.5)
     hull = visual_hull(mask, cameras, BOX, replace(fusion.HullConfig(), resolution=14))

@@ -89,7 +89,9 @@ def test_half_of_the_cameras_must_see_a_point(views, expected):
 def test_cropped_subjects_keep_what_some_cameras_do_not_see(path):
     """A camera that sees the lower half only says nothing about the upper one."""
     cameras = dome(6)
-    everyone = concatenate_cameras([cameras, camera_at((0.0, -0.5, 2.5), target=(0.0, -0.9, 0.0), name="low")])
+    everyone = concatenate_cameras(
+        [cameras, camera_at((0.0, -0.5, 2.5), target=(0.0, -0.9, 0.0), name="low")]
+    )
     masks = ball_masks(everyone)
     assert masks[6, 0].any(), "the subject leaves this image at the top"
     with_it = visual_hull(masks, everyone, around(0.6), SMALL)
@@ -118,7 +120,9 @@ def test_the_search_finds_nothing_where_masks_contradict(path):
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 1000.0])
 def test_bounds_from_masks_hold_the_subject(scale):
-    cameras = concatenate_cameras([camera_at(eye) for eye in ((2.5, 0.5, 0.0), (1.5, 0.2, 2.0), (-1.0, 0.0, 2.4))])
+    cameras = concatenate_cameras(
+        [camera_at(eye) for eye in ((2.5, 0.5, 0.0), (1.5, 0.2, 2.0), (-1.0, 0.0, 2.4))]
+    )
     masks = ball_masks(cameras, center=(0.2, 0.1, 0.3), radius=0.4)
     pose = cameras.camera_from_world.clone()
     pose[:, :3, 3] *= scale

@@ -48,7 +48,9 @@ def test_an_arc_is_swung_around_the_rigs_middle(arc_deg):
     if arc_deg == 360:
         assert (around.diff() % 360).sub(9).abs().max() < 0.1
     else:
-        assert around.mean() == pytest.approx(-5, abs=5) and around.max() - around.min() == pytest.approx(40, abs=0.5)
+        assert around.mean() == pytest.approx(-5, abs=5) and around.max() - around.min() == pytest.approx(
+            40, abs=0.5
+        )
 
 
 def test_a_path_is_fitted_to_all_points():

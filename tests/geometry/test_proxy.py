@@ -29,7 +29,10 @@ def test_a_ball_comes_back():
 def test_large_bounds_cost_no_detail(bounds):
     cameras = dome(8)
     masks = ball_masks(cameras)
-    tight, loose = reconstruct(masks, cameras, around(0.6), CONFIG), reconstruct(masks, cameras, bounds, CONFIG)
+    tight, loose = (
+        reconstruct(masks, cameras, around(0.6), CONFIG),
+        reconstruct(masks, cameras, bounds, CONFIG),
+    )
     assert float(loose.bounds.size_m.max()) < 1.35 * float(tight.bounds.size_m.max())
     assert volume(loose.mesh) == pytest.approx(volume(tight.mesh), rel=0.03)
 
@@ -58,7 +61,9 @@ def test_a_cropped_subject_is_closed_where_the_cameras_end():
 def test_moving_to_a_device_keeps_everything():
     cameras = dome(4)
     moved = reconstruct(ball_masks(cameras), cameras, around(0.6), CONFIG).to("meta")
-    assert moved.mesh.vertices.device.type == moved.normals.device.type == moved.bounds.low.device.type == "meta"
+    assert (
+        moved.mesh.vertices.device.type == moved.normals.device.type == moved.bounds.low.device.type == "meta"
+    )
 
 
 def test_real_captures_overlap_their_masks(shared):

@@ -50,7 +50,9 @@ def test_equals_the_twin(ball_scene, draw, cull):
     clear = torch.from_numpy(margin > 1e-4)
     assert clear.float().mean() > 0.97
     assert (raster.triangle == torch.from_numpy(triangle))[clear].all()
-    torch.testing.assert_close(raster.depth.double()[clear], torch.from_numpy(depth)[clear], rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        raster.depth.double()[clear], torch.from_numpy(depth)[clear], rtol=1e-5, atol=0
+    )
     assert (raster.triangle >= 0).any(-1).any(-1).all()
 
 

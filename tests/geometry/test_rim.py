@@ -10,7 +10,9 @@ from viewmend.geometry.rim import rim_depth
 @pytest.mark.parametrize("shape", [(1, 1), (3, 40), (17, 12)])
 def test_the_rim_has_the_smallest_depth_within_two_pixels(shape, dtype):
     rng = torch.Generator().manual_seed(sum(shape))
-    depth = torch.where(torch.rand(shape, generator=rng) < 0.1, 1 + torch.rand(shape, generator=rng), 0.0).to(dtype)
+    depth = torch.where(torch.rand(shape, generator=rng) < 0.1, 1 + torch.rand(shape, generator=rng), 0.0).to(
+        dtype
+    )
     found = rim_depth(depth)
     for row in range(shape[0]):
         for column in range(shape[1]):

@@ -33,7 +33,9 @@ def test_samples_equal_their_twin(rng, padding):
     uv[:, 0] = torch.tensor([0.5, 0.5])
     uv[:, 1] = torch.tensor([7.0, 5.0])
     found = sample_bilinear(images, uv, padding)
-    assert torch.allclose(found[:, 0], images[:, :, 0, 0], atol=1e-6), "a pixel's centre has the pixel's colour"
+    assert torch.allclose(found[:, 0], images[:, :, 0, 0], atol=1e-6), (
+        "a pixel's centre has the pixel's colour"
+    )
     for view in range(2):
         for point, (u, v) in enumerate(uv[view].tolist()):
             twin = [sample_twin(channel, u, v, padding) for channel in images[view]]

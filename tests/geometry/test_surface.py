@@ -49,7 +49,9 @@ def test_noise_gives_a_closed_surface_too(seed):
 
 
 def test_numba_equals_torch():
-    values = torch.nn.functional.pad(torch.rand(9, 12, 10, generator=torch.Generator().manual_seed(9)), (1,) * 6)
+    values = torch.nn.functional.pad(
+        torch.rand(9, 12, 10, generator=torch.Generator().manual_seed(9)), (1,) * 6
+    )
     values[values > 0.8] = 0.5  # which is outside, for all who count
     fast, slow = Mesh(*march_numba(values)), Mesh(*march_torch(values))
     assert torch.equal(fast.faces, slow.faces)

@@ -20,7 +20,9 @@ seeds = st.integers(0, 10_000)
 def random_rig(seed: int, views: int = 3) -> Cameras:
     """Cameras anywhere, looking anywhere, with skewed, uneven K."""
     rng = torch.Generator().manual_seed(seed)
-    pose = rigid(rotation_from_axis_angle(torch.randn(views, 3, generator=rng)), torch.randn(views, 3, generator=rng))
+    pose = rigid(
+        rotation_from_axis_angle(torch.randn(views, 3, generator=rng)), torch.randn(views, 3, generator=rng)
+    )
     K = torch.tensor([[80.0, 0.0, 50.0], [0.0, 80.0, 40.0], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
     K[:, 0, 0] *= 0.5 + torch.rand(views, generator=rng)
     K[:, 0, 1] = 4 * torch.randn(views, generator=rng)

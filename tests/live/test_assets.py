@@ -86,8 +86,15 @@ def test_images_show_the_subject_as_their_cameras_see_it(ball):
         whole_K = frame.cameras.K[number]
         left, top = (round(float(whole_K[axis, 2]) - camera["K"][3 * axis + 2]) for axis in (0, 1))
         height, width = mask.shape
-        part = frame.rgb[number, :, top : top + height, left : left + width].movedim(0, -1).numpy().astype(int)
-        assert np.abs(mask.astype(int) - frame.mask[number, top : top + height, left : left + width].numpy()).max() <= 8
+        part = (
+            frame.rgb[number, :, top : top + height, left : left + width].movedim(0, -1).numpy().astype(int)
+        )
+        assert (
+            np.abs(
+                mask.astype(int) - frame.mask[number, top : top + height, left : left + width].numpy()
+            ).max()
+            <= 8
+        )
         assert int((frame.mask[number] > 8).sum()) == int((mask > 0).sum()), "the foreground is complete"
         assert np.abs(rgb - part)[mask > 200].mean() < 5
 
@@ -114,7 +121,9 @@ def test_versioned_assets_are_cached_for_good_and_others_revalidated(ball):
         tag = headers["etag"]
         for query in ("", "?v=other"):
             _, headers, again = get(f"{ball.url}{path}{query}")
-            assert headers["cache-control"] == "public, no-cache" and headers["etag"] == tag and again == content
+            assert (
+                headers["cache-control"] == "public, no-cache" and headers["etag"] == tag and again == content
+            )
         for known in (tag, f'"other", W/{tag}', "*"):
             status, headers, body = get(f"{ball.url}{path}", {"If-None-Match": known})
             assert status == 304 and not body and headers["etag"] == tag
@@ -123,7 +132,15 @@ def test_versioned_assets_are_cached_for_good_and_others_revalidated(ball):
 
 
 def test_malformed_requests_are_refused(ball):
-    for path, status in {"9": 404, "0/6": 404, "-1": 400, "x": 400, "0/x": 400, "0?w=1": 400, "9" * 5000: 400}.items():
+    for path, status in {
+        "9": 404,
+        "0/6": 404,
+        "-1": 400,
+        "x": 400,
+        "0/x": 400,
+        "0?w=1": 400,
+        "9" * 5000: 400,
+    }.items():
         answered, _, body = get(f"{ball.url}/assets/{path}")
         assert answered == status and json.loads(body)["error"], path
 

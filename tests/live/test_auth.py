@@ -38,8 +38,15 @@ def test_pages_of_other_sites_are_refused(ball):
     for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
         assert get(f"{ball.url}/health", headers)[0] == 403 and get(f"{ball.url}/", headers)[0] == 403
     assert get(f"{ball.url}/health", {"Origin": ball.url})[0] == 200
-    rebound = {"Host": f"127.0.0.1.evil.example:{ball.port}", "Origin": f"http://127.0.0.1.evil.example:{ball.port}"}
-    for headers in (rebound, {"Origin": "http://["}, {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}):
+    rebound = {
+        "Host": f"127.0.0.1.evil.example:{ball.port}",
+        "Origin": f"http://127.0.0.1.evil.example:{ball.port}",
+    }
+    for headers in (
+        rebound,
+        {"Origin": "http://["},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"},
+    ):
         assert get(f"{ball.url}/frame.jpg?width=16&height=16", headers)[0] == 403
     link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}
     assert get(ball.url, link)[0] == get(ball.url, {"Sec-Fetch-Site": "same-origin"})[0] == 200
@@ -50,7 +57,16 @@ def test_pages_of_other_sites_are_refused(ball):
 
 
 @pytest.mark.parametrize(
-    "host", ["[::1].evil.com", "localhost:80@evil.com", "localhost/", "127.0.0.1.evil.com", "", "[::1", "localhost:x"]
+    "host",
+    [
+        "[::1].evil.com",
+        "localhost:80@evil.com",
+        "localhost/",
+        "127.0.0.1.evil.com",
+        "",
+        "[::1",
+        "localhost:x",
+    ],
 )
 def test_hosts_are_parsed_and_not_matched(ball, host):
     answer = exchange(ball, f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
@@ -99,7 +115,9 @@ def test_an_origin_has_the_default_port_of_its_scheme():
 
     assert not is_refused("rig.example", "https://rig.example:443")
     assert not is_refused("rig.example:80", "http://RIG.example")
-    assert is_refused("rig.example", "https://rig.example:8008") and is_refused("rig.example", "file://rig.example")
+    assert is_refused("rig.example", "https://rig.example:8008") and is_refused(
+        "rig.example", "file://rig.example"
+    )
     assert is_refused("rig.example:80", "https://rig.example")
 
 

@@ -29,7 +29,12 @@ class Device:
     """Stage times of a machine, by another cost model than the controller's."""
 
     def __init__(self, shared=10.0, pixels=20.0, filling=200.0, context_share=0.6, noise=0.0, seed=0):
-        self.shared, self.pixels, self.relative_cost, self.context_share = shared, pixels, filling, context_share
+        self.shared, self.pixels, self.relative_cost, self.context_share = (
+            shared,
+            pixels,
+            filling,
+            context_share,
+        )
         self.noise, self.chance = noise, random.Random(seed)
 
     def frame(self, level: QualityLevel) -> FrameTimes:
@@ -41,7 +46,9 @@ class Device:
         encoding = 0.2 * self.relative_cost * by if level.context_times else 0.0
         filling = 0.8 * self.relative_cost * size * context * by
         rendering = self.pixels * level.scale**2 * by
-        return FrameTimes(geometry=self.shared * by, context=encoding, rendering=rendering, inpainting=filling)
+        return FrameTimes(
+            geometry=self.shared * by, context=encoding, rendering=rendering, inpainting=filling
+        )
 
 
 def run(budget: Budget, device: Device, frames: int) -> tuple[list[int], list[float]]:
@@ -118,7 +125,9 @@ def test_a_model_that_predicts_errors_refines_a_part_instead_of_using_less_conte
     assert ladder_for(ViewSynthNet(ViewsConfig(error_features=8))) is REFINE_LADDER
     assert ladder_for(ViewSynthNet(ViewsConfig())) is CONTEXT_LADDER and ladder_for(Telea()) is CONTEXT_LADDER
     assert all(level.context_times == FULL.context_times for level in REFINE_LADDER.levels)
-    assert all((level.top_k or 0) <= PAPER_TOP_K for level in CONTEXT_LADDER.levels), "no level keeps more than FULL"
+    assert all((level.top_k or 0) <= PAPER_TOP_K for level in CONTEXT_LADDER.levels), (
+        "no level keeps more than FULL"
+    )
     assert all(0 <= level.refine_fraction < 1 for level in REFINE_LADDER.levels[:-1])
 
 
@@ -132,7 +141,9 @@ def test_the_predicted_time_grows_with_the_pixels():
     half = QualityLevel(0.5, 7, None)
     budget = Budget(100.0, (half, FULL))
     budget.record(half, FrameTimes(geometry=3.0, rendering=4.0, encode=6.0, wait=50.0))
-    assert budget.predict_ms(FULL) == pytest.approx(3 + 40) and budget.predict_ms(half) == pytest.approx(3 + 10)
+    assert budget.predict_ms(FULL) == pytest.approx(3 + 40) and budget.predict_ms(half) == pytest.approx(
+        3 + 10
+    )
     assert budget.measured_ms == pytest.approx(13.0), "without the time that a look waits"
 
 
@@ -156,7 +167,9 @@ def test_it_goes_up_only_where_the_next_level_has_room():
     budget.record(FULL, FrameTimes(inpainting=400.0))
     for _ in range(30):
         assert budget.index == 0
-        budget.record(levels[0], FrameTimes(inpainting=80.0))  # this level has room, but the full one would take 320 ms
+        budget.record(
+            levels[0], FrameTimes(inpainting=80.0)
+        )  # this level has room, but the full one would take 320 ms
     for _ in range(30):
         budget.record(budget.level, FrameTimes(inpainting=80.0 * budget.level.scale**2))
     assert budget.level == FULL

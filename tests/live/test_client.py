@@ -61,7 +61,10 @@ def test_without_reconnecting_a_lost_connection_is_an_error(ball):
 def test_a_refusal_is_not_a_lost_connection(ball):
     with running(limits=Limits(viewers=1), token="a token, long enough", ready=False) as server:
         for token, reason in (("no", r"refuses \(401\)"), ("a token, long enough", "at most 1 viewers")):
-            with Client(server.ws, "a token, long enough"), pytest.raises(ConnectionError, match=reason) as refused:
+            with (
+                Client(server.ws, "a token, long enough"),
+                pytest.raises(ConnectionError, match=reason) as refused,
+            ):
                 Client(server.ws, token, again_s=60.0).__enter__()
             assert not isinstance(refused.value, ConnectionLostError)
 

@@ -62,7 +62,9 @@ def test_a_camera_that_is_left_out_neither_colours_nor_carves(views):
 
 @pytest.mark.parametrize("without", [(), (LEFT_OUT,)])
 def test_another_model_completes_the_same_view(views, without):
-    result = rendered(prepared(views), model="paper-small", without=without, extra_modes=frozenset({"compared"}))
+    result = rendered(
+        prepared(views), model="paper-small", without=without, extra_modes=frozenset({"compared"})
+    )
     (alone,) = rendered(prepared(load_inpainter("paper-small"), without)).completed
     ((own, extra),) = result.eyes
     assert (extra["compared"][:3] - alone.rgb).abs().max() < 1e-4
@@ -95,7 +97,13 @@ def test_errors_and_score_over_http(ball: Running):
     assert status == 200 and 5 < float(headers["X-Viewmend-PSNR"]) < 60
     assert decode(content).shape[:2] == tuple(CAMERAS.size_px[2].tolist()[::-1])
     assert get(f"{ball.url}/frame.jpg?time=0&mode=completed")[1]["X-Viewmend-PSNR"] is None
-    for wrong in ("mode=error", "mode=compared", "model=../views", "camera=none", "without=" + ",".join(CAMERAS.names)):
+    for wrong in (
+        "mode=error",
+        "mode=compared",
+        "model=../views",
+        "camera=none",
+        "without=" + ",".join(CAMERAS.names),
+    ):
         status, _, content = get(f"{ball.url}/frame.jpg?time=0&{wrong}")
         assert status == 400 and "expected" in json.loads(content)["error"], wrong
 
@@ -106,7 +114,9 @@ def test_assets_without_a_camera(ball: Running):
         status, headers, content = get(f"{ball.url}/assets/0?without={without}")
         assert status == 200
         shapes[without] = [camera["name"] for camera in unpack(content)[0]["cameras"]], headers["ETag"]
-    assert shapes[""][0] == list(CAMERAS.names) and shapes[LEFT_OUT][0] == [n for n in CAMERAS.names if n != LEFT_OUT]
+    assert shapes[""][0] == list(CAMERAS.names) and shapes[LEFT_OUT][0] == [
+        n for n in CAMERAS.names if n != LEFT_OUT
+    ]
     assert shapes[""][1] != shapes[LEFT_OUT][1]
     status, _, content = get(f"{ball.url}/assets/0?without={','.join(CAMERAS.names[1:])}")
     assert status == 404 and "two input cameras" in json.loads(content)["error"]

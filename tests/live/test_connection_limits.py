@@ -167,7 +167,9 @@ def test_turns_are_taken_one_at_a_time_with_pauses_and_new_connections_first():
         scheduler.submit(turn(name, elsewhere_s=0.5), False)
     while timers.planned:
         timers.run_next()
-    assert taken[-1][1] - taken[-2][1] == pytest.approx(0.5 + limits.MIN_PAUSE_S), "other programs prolong no pause"
+    assert taken[-1][1] - taken[-2][1] == pytest.approx(0.5 + limits.MIN_PAUSE_S), (
+        "other programs prolong no pause"
+    )
     clock.advance(1.0)
     for callback in (lambda: 1 / 0, turn("alone")):
         scheduler.submit(callback, False)
@@ -368,7 +370,11 @@ def test_pongs_that_are_not_read_are_not_stored(ball):
 
 def test_a_crowd_of_unauthenticated_clients_leaves_room_for_a_viewer(monkeypatch):
     monkeypatch.setattr(limits, "MAX_UNAUTHENTICATED", 20)
-    with running(token=TOKEN) as server, contextlib.ExitStack() as stack, Client(server.ws, token=TOKEN) as viewer:
+    with (
+        running(token=TOKEN) as server,
+        contextlib.ExitStack() as stack,
+        Client(server.ws, token=TOKEN) as viewer,
+    ):
         crowd = [stack.enter_context(open_socket(server)) for _ in range(60)]
         wait_until(lambda: len(server.connections) <= 21)
         assert server.is_serving()
@@ -388,7 +394,11 @@ def test_a_crowd_of_unauthenticated_clients_leaves_room_for_a_viewer(monkeypatch
     ids=["messages", "body", "body and token", "trailers", "requests"],
 )
 def test_a_flood_of_unauthenticated_input_does_not_stop_a_viewer(first, more, caplog):
-    with running(token=TOKEN) as server, Client(server.ws, token=TOKEN) as viewer, contextlib.ExitStack() as stack:
+    with (
+        running(token=TOKEN) as server,
+        Client(server.ws, token=TOKEN) as viewer,
+        contextlib.ExitStack() as stack,
+    ):
         crowd = [stack.enter_context(open_socket(server)) for _ in range(40)]
         for raw in crowd:
             raw.setblocking(False)
@@ -400,7 +410,9 @@ def test_a_flood_of_unauthenticated_input_does_not_stop_a_viewer(first, more, ca
                     left[n] = (left[n] or memoryview(more))[raw.send(left[n] or more) :]
                 with contextlib.suppress(OSError):
                     raw.recv(65536)
-            viewer.frame(viewer.look(width=32, height=32, camera={"azimuth": float(number)}, modes=["rendered"]))
+            viewer.frame(
+                viewer.look(width=32, height=32, camera={"azimuth": float(number)}, modes=["rendered"])
+            )
     assert not caplog.records, "unauthenticated clients cause no log lines"
 
 
@@ -424,7 +436,11 @@ def test_a_malformed_body_is_answered_once(ball, sent, caplog):
 
 
 def test_pieces_of_a_request_are_put_together():
-    whole = b"GET /health?token=a+long+secret+indeed HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 12_000 + b"\r\n\r\n"
+    whole = (
+        b"GET /health?token=a+long+secret+indeed HTTP/1.1\r\nHost: localhost\r\nX: "
+        + b"x" * 12_000
+        + b"\r\n\r\n"
+    )
     with running(token=TOKEN) as server, open_socket(server) as raw:
         for part in (whole[:1], whole[1:9000], whole[9000:] + whole + whole):
             raw.sendall(part)

@@ -6,13 +6,22 @@ import torch
 from live.live_servers import decode, get, running
 
 from viewmend.live.client import Client
-from viewmend.live.encoding import COLOURS, draw_mode, mean_confidence, pack_depth, surface_depth, unpack_depth
+from viewmend.live.encoding import (
+    COLOURS,
+    draw_mode,
+    mean_confidence,
+    pack_depth,
+    surface_depth,
+    unpack_depth,
+)
 from viewmend.models.smooth_fill import SmoothFill
 
 
 def test_every_mode(ball_view):
     rgb = (ball_view.rgb.movedim(0, -1) * 255).numpy()
-    images = {mode: draw_mode(ball_view, mode) for mode in ("rendered", "holes", "completed", "depth", "coverage")}
+    images = {
+        mode: draw_mode(ball_view, mode) for mode in ("rendered", "holes", "completed", "depth", "coverage")
+    }
     assert all(image.shape == (48, 48, 3) and image.dtype == np.uint8 for image in images.values())
     assert np.abs(images["completed"] - rgb).max() <= 1
     assert images["rendered"][22, 22].tolist() == [0, 0, 0]
@@ -35,9 +44,14 @@ def test_confidence_is_a_heat_map(ball_view):
     view, alpha = ball_view.view, 0.5 * ball_view.view.mask
     sure, unsure = (replace(ball_view, alpha=alpha, confidence=value * view.mask) for value in (1.0, 0.25))
     assert mean_confidence(ball_view) is None
-    assert mean_confidence(sure) == pytest.approx(1, abs=1e-3) and mean_confidence(unsure) == pytest.approx(0.25)
+    assert mean_confidence(sure) == pytest.approx(1, abs=1e-3) and mean_confidence(unsure) == pytest.approx(
+        0.25
+    )
     yellow, violet = (draw_mode(one, "confidence") for one in (sure, unsure))
-    assert np.abs(yellow[24, 24] - np.array([253, 231, 36]) / 2).max() <= 1 and violet[24, 24, 2] > violet[24, 24, 0]
+    assert (
+        np.abs(yellow[24, 24] - np.array([253, 231, 36]) / 2).max() <= 1
+        and violet[24, 24, 2] > violet[24, 24, 0]
+    )
     assert yellow[0, 0].tolist() == [0, 0, 0], "no subject, no colour"
     grey = draw_mode(ball_view, "confidence")
     assert grey.max() > 40 and (grey == grey[..., :1]).all(), "without confidence, without colour"

@@ -7,7 +7,16 @@ import random
 import threading
 
 import pytest
-from live.live_servers import FakeClock, close_code, get, open_socket, open_websocket, running, say_hello, wait_until
+from live.live_servers import (
+    FakeClock,
+    close_code,
+    get,
+    open_socket,
+    open_websocket,
+    running,
+    say_hello,
+    wait_until,
+)
 from websockets.exceptions import ConnectionClosed
 
 from viewmend.live import connection, connection_limits
@@ -17,16 +26,22 @@ from viewmend.live.protocol import Limits
 
 def malformed(chance: random.Random):
     """One malformed message: random data, part of a message, or a message with an invalid value."""
-    whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3, "target": [1, 2, 3]}, "modes": ["completed"]})
+    whole = json.dumps(
+        {"type": "look", "id": 1, "camera": {"azimuth": 3, "target": [1, 2, 3]}, "modes": ["completed"]}
+    )
     wrong = chance.choice([None, -1, 1e30, "x", [], {}, True, [[1]], {"a": {}}, 0.5])
-    key = chance.choice(["type", "width", "camera", "modes", "eyes", "scale", "moving", "quality", "id", "codec"])
+    key = chance.choice(
+        ["type", "width", "camera", "modes", "eyes", "scale", "moving", "quality", "id", "codec"]
+    )
     return chance.choice(
         [
             chance.randbytes(chance.randrange(60)),
             "".join(chr(chance.randrange(32, 0x2FF)) for _ in range(chance.randrange(60))),
             whole[: chance.randrange(len(whole))],
             json.dumps({"type": "look", key: wrong}),
-            json.dumps({"type": chance.choice(["ack", "clock", "ping", "hello"]), "frame": wrong, "seek": wrong}),
+            json.dumps(
+                {"type": chance.choice(["ack", "clock", "ping", "hello"]), "frame": wrong, "seek": wrong}
+            ),
             "[" * chance.randrange(2000),
         ]
     )

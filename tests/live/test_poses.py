@@ -76,13 +76,17 @@ def test_a_requested_field_of_view_is_vertical():
 @pytest.mark.parametrize(("height_m", "elevation"), [(30.0, 80.0), (-30.0, -80.0), (2.0, 45.0)])
 def test_the_initial_elevation_is_limited(height_m, elevation):
     overhead = concatenate_cameras([camera_at(90 * n, f"c{n}", 48, height_m) for n in range(4)])
-    assert home_view(overhead, torch.zeros(3), torch.tensor([0.0, 1, 0])).elevation == pytest.approx(elevation)
+    assert home_view(overhead, torch.zeros(3), torch.tensor([0.0, 1, 0])).elevation == pytest.approx(
+        elevation
+    )
 
 
 def test_cameras_as_json():
     (said,) = cameras_json(camera_at(0, "c"))
     assert said["width"] == 48 and len(said["K"]) == 9 and len(said["R"]) == 9
-    assert said["center"] == pytest.approx([0, 0, 2], abs=1e-5) and said["T"] == pytest.approx([0, 0, 2], abs=1e-5)
+    assert said["center"] == pytest.approx([0, 0, 2], abs=1e-5) and said["T"] == pytest.approx(
+        [0, 0, 2], abs=1e-5
+    )
 
 
 def test_two_eyes_have_no_disparity_at_the_subject_and_some_elsewhere():
@@ -96,7 +100,9 @@ def test_two_eyes_have_no_disparity_at_the_subject_and_some_elsewhere():
     points = torch.stack([torch.zeros(3), 0.3 * rightward, -0.5 * ahead, 0.5 * ahead])
     (l_uv, r_uv) = (project(points, eye)[0][0] for eye in (left, right))
     apart = (l_uv - r_uv)[:, 0]
-    assert torch.allclose(apart[:2], torch.zeros(2), atol=1e-3) and torch.allclose(l_uv[:, 1], r_uv[:, 1], atol=1e-3)
+    assert torch.allclose(apart[:2], torch.zeros(2), atol=1e-3) and torch.allclose(
+        l_uv[:, 1], r_uv[:, 1], atol=1e-3
+    )
     assert apart[2] > 0.5 and apart[3] < -0.3, "nearer points have crossed disparity"
     behind = stereo_pair(camera, 0.1, 5 * camera.centers[0])
     assert all(torch.equal(eye.K, camera.K) for eye in behind)

@@ -6,7 +6,17 @@ import struct
 import pytest
 
 from viewmend.live import protocol
-from viewmend.live.protocol import Ack, Camera, Cancel, ClockChange, FrameTimes, Hello, Limits, Look, ProtocolError
+from viewmend.live.protocol import (
+    Ack,
+    Camera,
+    Cancel,
+    ClockChange,
+    FrameTimes,
+    Hello,
+    Limits,
+    Look,
+    ProtocolError,
+)
 
 LIMITS = Limits()
 
@@ -16,7 +26,9 @@ def said(**message):
 
 
 def test_every_message_is_parsed():
-    assert said(type="hello", version=1, codecs=["h264", "theora", "jpeg"]) == Hello(1, ("h264", "theora", "jpeg"))
+    assert said(type="hello", version=1, codecs=["h264", "theora", "jpeg"]) == Hello(
+        1, ("h264", "theora", "jpeg")
+    )
     assert said(type="ack", frame=3) == Ack(3)
     assert said(type="cancel") == Cancel()
     assert said(type="ping", sent_ms=1.5) == protocol.Ping(1.5)
@@ -24,9 +36,16 @@ def test_every_message_is_parsed():
     assert said(type="clock", playing=False, live=True) == ClockChange(False, None, None, True)
     assert said(type="look") == Look()
     look = said(
-        type="look", id=7, camera={"azimuth": 20, "target": [1, 2, 3]}, modes=["holes", "completed"], top_k=None
+        type="look",
+        id=7,
+        camera={"azimuth": 20, "target": [1, 2, 3]},
+        modes=["holes", "completed"],
+        top_k=None,
     )
-    assert look.cameras == (Camera(azimuth=20.0, target=(1.0, 2.0, 3.0)),) and look.modes == ("holes", "completed")
+    assert look.cameras == (Camera(azimuth=20.0, target=(1.0, 2.0, 3.0)),) and look.modes == (
+        "holes",
+        "completed",
+    )
     two = said(type="look", eyes=[{"fx": 100}, {"fx": 100, "cx": 3}])
     assert two.cameras == (Camera(fx=100.0), Camera(fx=100.0, cx=3.0))
     turned = said(type="look", camera={"R": [0, 1, 0, -1, 0, 0, 0, 0, 1], "T": [0, 0, 2], "fov_y": 40})
@@ -36,7 +55,10 @@ def test_every_message_is_parsed():
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        ({"type": "shout"}, 'type: expected hello or look or cancel or ack or clock or on_air or ping, got "shout"'),
+        (
+            {"type": "shout"},
+            'type: expected hello or look or cancel or ack or clock or on_air or ping, got "shout"',
+        ),
         ({"type": "look", "width": 5000}, "from 16 to 2048 pixels, got 5000 x 320"),
         ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
         ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),
@@ -48,7 +70,10 @@ def test_every_message_is_parsed():
         ({"type": "look", "error_rule": "some"}, 'error_rule: expected .*, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
         ({"type": "look", "modes": ["compared"]}, "expected 'model' for the mode 'compared'"),
-        ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}}, "expected 'R' as a rotation"),
+        (
+            {"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}},
+            "expected 'R' as a rotation",
+        ),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}, "'T'"),
         ({"type": "look", "camera": {"distance": -1}}, "camera: distance: expected a number >= 0.02, got -1"),
         ({"type": "look", "camera": [1]}, "expected an object of keys"),
@@ -65,7 +90,16 @@ def test_errors_name_the_invalid_value(message, words):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "NaN", '{"type": "ack", "frame": NaN}', '{"type":"ping","sent_ms":1e999}', "[" * 9000, "9" * 9000]
+    "text",
+    [
+        "",
+        "{",
+        "NaN",
+        '{"type": "ack", "frame": NaN}',
+        '{"type":"ping","sent_ms":1e999}',
+        "[" * 9000,
+        "9" * 9000,
+    ],
 )
 def test_invalid_json_is_refused(text):
     with pytest.raises(ProtocolError):

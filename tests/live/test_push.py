@@ -10,7 +10,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from live.live_servers import CAMERAS, WAIT_S, close_code, get, open_websocket, running, true_image, wait_until
+from live.live_servers import (
+    CAMERAS,
+    WAIT_S,
+    close_code,
+    get,
+    open_websocket,
+    running,
+    true_image,
+    wait_until,
+)
 from reference.ball import photograph
 from websockets.exceptions import ConnectionClosed
 
@@ -38,7 +47,10 @@ def test_pushed_frames_are_shown_at_the_edge_and_can_be_sought():
             look = viewer.look(camera={"azimuth": 200.0}, width=48, height=48, quality=95)
             shown = viewer.frame(look)
             right = true_image(server.service.renderer.home, (48, 48), azimuth=200.0)
-            assert shown.header["time"] == 2 and np.abs(shown.images[0, "completed"] - right.astype(float)).mean() < 14
+            assert (
+                shown.header["time"] == 2
+                and np.abs(shown.images[0, "completed"] - right.astype(float)).mean() < 14
+            )
             rig.push(photograph(CAMERAS).without(["c7"]))
             assert viewer.frame().header["time"] == 3
             viewer.send("clock", seek=1, playing=False)
@@ -88,7 +100,9 @@ def rig_message(**changes):
 
 CAMERA = cameras_json(CAMERAS)[0]
 # Four cameras have a million pixels, but need a tensor of a billion.
-ODD = [CAMERA | {"name": str(n), "width": (16, 16_000)[n % 2], "height": (16_000, 16)[n % 2]} for n in range(4)]
+ODD = [
+    CAMERA | {"name": str(n), "width": (16, 16_000)[n % 2], "height": (16_000, 16)[n % 2]} for n in range(4)
+]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +229,9 @@ def test_a_frame_needs_two_complete_cameras():
     with pytest.raises(ProtocolError, match="image and mask of two cameras or more, got 1"):
         decode("c0")
     frame = decode("c4", "c1")
-    assert frame.cameras.names == ("c1", "c4") and bool((frame.rgb == 9).all()) and bool((frame.mask == 9).all())
+    assert (
+        frame.cameras.names == ("c1", "c4") and bool((frame.rgb == 9).all()) and bool((frame.mask == 9).all())
+    )
 
 
 def test_a_message_that_is_too_large_for_the_rig_is_not_read():

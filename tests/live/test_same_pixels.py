@@ -23,7 +23,9 @@ SIZE_PX = (480, 360)
 
 def served(capture, model, align=True):
     """A view of the first frame as `viewmend serve` renders it, and its camera."""
-    source = serve.open_source(serve.Options(source=str(capture), preparation=PreparationOptions(align=align)))
+    source = serve.open_source(
+        serve.Options(source=str(capture), preparation=PreparationOptions(align=align))
+    )
     source.start()
     try:
         renderer = Renderer(source, make_method(model))
@@ -46,15 +48,33 @@ def test_serve_and_mend_show_the_same_pixels_of_wd2(shared, tmp_path, model):
     capture = shared / "captures/wd2"
     page, camera = served(capture, model)
     pose = torch.linalg.inv(camera.camera_from_world[0])
-    path = {"world_from_camera": [pose.tolist()], "K": camera.K[0].tolist(), "width": SIZE_PX[0], "height": SIZE_PX[1]}
+    path = {
+        "world_from_camera": [pose.tolist()],
+        "K": camera.K[0].tolist(),
+        "width": SIZE_PX[0],
+        "height": SIZE_PX[1],
+    }
     (tmp_path / "path.json").write_text(json.dumps(path))
-    options = ["--path", tmp_path / "path.json", "--frames", "0:1", "--model", model, "--out", tmp_path / "out"]
+    options = [
+        "--path",
+        tmp_path / "path.json",
+        "--frames",
+        "0:1",
+        "--model",
+        model,
+        "--out",
+        tmp_path / "out",
+    ]
     assert main(["mend", str(capture), *map(str, options)]) == 0
     (written,) = (tmp_path / "out/completed").glob("*.png")
     command = cv2.imread(str(written))[..., ::-1]
     assert command.shape == (360, 480, 3) and command.any(2).mean() > 0.05
     off = np.abs(command.astype(int) - page.astype(int)).max(2)
-    assert (off > 1).mean() < 2e-4, "a pose in JSON is rounded, and an edge may fall to the other side of a pixel"
+    assert (off > 1).mean() < 2e-4, (
+        "a pose in JSON is rounded, and an edge may fall to the other side of a pixel"
+    )
     if model == "telea":  # the quicker one
         unaligned, _ = served(capture, model, align=False)
-        assert (np.abs(unaligned.astype(int) - page.astype(int)).max(2) > 1).mean() > 0.01, "the alignment shows"
+        assert (np.abs(unaligned.astype(int) - page.astype(int)).max(2) > 1).mean() > 0.01, (
+            "the alignment shows"
+        )

@@ -12,7 +12,17 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from live.live_servers import CAMERAS, decode, exchange, get, open_socket, post, running, true_image, wait_until
+from live.live_servers import (
+    CAMERAS,
+    decode,
+    exchange,
+    get,
+    open_socket,
+    post,
+    running,
+    true_image,
+    wait_until,
+)
 from reference.ball import BallCapture
 
 from viewmend.live import frame_source, render_jobs
@@ -38,7 +48,12 @@ def test_the_command_is_parsed_before_torch_is_imported():
 def test_health_and_metrics(ball):
     status, _, body = get(f"{ball.url}/health")
     health = json.loads(body)
-    assert status == 200 and health["status"] == "ok" and health["source"] == "ready" and health["name"] == "ball"
+    assert (
+        status == 200
+        and health["status"] == "ok"
+        and health["source"] == "ready"
+        and health["name"] == "ball"
+    )
     status, headers, body = get(f"{ball.url}/metrics")
     assert status == 200 and headers["content-type"].startswith("text/plain")
     lines = [line for line in body.decode().splitlines() if not line.startswith("#")]
@@ -53,11 +68,16 @@ def test_health_and_metrics(ball):
 def test_an_image_from_a_requested_camera(ball):
     home = ball.service.renderer.home
     for azimuth in (20, 200):
-        status, headers, body = get(f"{ball.url}/frame.jpg?azimuth={azimuth}&time=0&width=64&height=48&mode=completed")
+        status, headers, body = get(
+            f"{ball.url}/frame.jpg?azimuth={azimuth}&time=0&width=64&height=48&mode=completed"
+        )
         image = decode(body)
         assert status == 200 and image.shape == (48, 64, 3) and headers["x-viewmend-time"] == "0"
         timing = dict(part.split(";dur=") for part in headers["server-timing"].split(", "))
-        assert list(timing) == ["geometry", "context", "rendering", "inpainting"] and float(timing["rendering"]) > 0
+        assert (
+            list(timing) == ["geometry", "context", "rendering", "inpainting"]
+            and float(timing["rendering"]) > 0
+        )
         right = true_image(home, (64, 48), azimuth=float(azimuth), elevation=0.0)
         assert np.abs(image.astype(float) - right).mean() < 14
     query = f"{ball.url}/frame.jpg?azimuth=200&time=0&width=64&height=48&mode=holes"
@@ -77,8 +97,14 @@ def test_an_image_from_a_requested_camera(ball):
         ("frame.jpg?distanse=3", "expected keys among"),
         ("frame.jpg?elevation=90", "elevation: expected"),
         ("frame.jpg?azimuth=nan", "azimuth: expected"),
-        *((f"frame.jpg?background={colour}", "expected") for colour in ("red", "00ff0", "00FF00", "00ff00%0A")),
-        *((f"camera.jpg?{query}", "expected") for query in ("", "name=none", "name=none&time=x", "name=none&size=3")),
+        *(
+            (f"frame.jpg?background={colour}", "expected")
+            for colour in ("red", "00ff0", "00FF00", "00ff00%0A")
+        ),
+        *(
+            (f"camera.jpg?{query}", "expected")
+            for query in ("", "name=none", "name=none&time=x", "name=none&size=3")
+        ),
         ("camera.jpg?name=" + 99 * "a", "expected"),
     ],
 )
@@ -90,17 +116,28 @@ def test_invalid_queries_are_refused(ball, query, words):
 def test_a_viewer_gets_its_view_and_frame(ball):
     with Client(ball.ws) as viewer:
         welcome = viewer.messages["welcome"]
-        assert welcome["version"] == 1 and welcome["modes"][2] == "completed" and welcome["limits"]["viewers"] == 8
+        assert (
+            welcome["version"] == 1
+            and welcome["modes"][2] == "completed"
+            and welcome["limits"]["viewers"] == 8
+        )
         rig = viewer.wait_for("rig")
         assert [camera["name"] for camera in rig["cameras"]] == list(CAMERAS.names) and rig["name"] == "ball"
         viewer.send("clock", playing=False, seek=0)
         look = viewer.look(
-            camera={"azimuth": 200.0}, width=64, height=64, modes=["rendered", "completed"], depth=True, quality=95
+            camera={"azimuth": 200.0},
+            width=64,
+            height=64,
+            modes=["rendered", "completed"],
+            depth=True,
+            quality=95,
         )
         shown = viewer.frame(look, full=True)
         assert set(shown.images) == {(0, "rendered"), (0, "completed")} and shown.header["time"] == 0
         right = true_image(ball.service.renderer.home, (64, 64), azimuth=200.0)
-        errors = {mode: np.abs(image - right.astype(float)).mean() for (_, mode), image in shown.images.items()}
+        errors = {
+            mode: np.abs(image - right.astype(float)).mean() for (_, mode), image in shown.images.items()
+        }
         assert errors["completed"] < 12 and errors["completed"] < errors["rendered"]
         assert shown.depth[0].shape == (64, 64) and 1.4 < shown.depth[0][32, 32] < 1.6
         assert 0 < shown.latency_ms < 20_000
@@ -147,7 +184,12 @@ def test_playback_pauses_seeks_and_follows_the_edge(ball):
         wait_until(lambda: viewer.wait_for("state")["live"])
         wait_until(lambda: viewer.frame(look).header["time"] != 1)
         stats = viewer.wait_for("stats")
-        assert stats["fps"] > 0 and set(stats["stage_ms"]) >= {"geometry", "rendering", "inpainting", "encode"}
+        assert stats["fps"] > 0 and set(stats["stage_ms"]) >= {
+            "geometry",
+            "rendering",
+            "inpainting",
+            "encode",
+        }
 
 
 def test_a_turntable_shows_the_whole_motion(ball):
@@ -157,7 +199,12 @@ def test_a_turntable_shows_the_whole_motion(ball):
     assert status == 200 and np.abs(fitted["target"]).max() < 0.1, "the ball moves about the origin"
     for azimuth in (-50.0, 40.0, 130.0):
         lens = {"fx": fitted["f"], "cx": 48.0, "cy": 32.0}
-        pose = {"azimuth": azimuth, "elevation": 20.0, "distance": fitted["distance"], "target": fitted["target"]}
+        pose = {
+            "azimuth": azimuth,
+            "elevation": 20.0,
+            "distance": fitted["distance"],
+            "target": fitted["target"],
+        }
         for time in range(3):
             with Client(ball.ws) as viewer:
                 viewer.send("clock", playing=False, seek=time)
@@ -174,10 +221,14 @@ def test_viewers_get_their_own_views_and_share_geometry(ball):
     def watch(azimuth):
         with Client(ball.ws) as viewer:
             viewer.send("clock", seek=2, playing=False)
-            look = viewer.look(camera={"azimuth": float(azimuth)}, width=48, height=48, modes=["rendered"], quality=95)
+            look = viewer.look(
+                camera={"azimuth": float(azimuth)}, width=48, height=48, modes=["rendered"], quality=95
+            )
             seen[azimuth] = [viewer.frame(look, full=True).images[0, "rendered"]]
             seen[azimuth] += [
-                viewer.frame(viewer.look(camera={"azimuth": float(azimuth)}, width=48, height=48, modes=["rendered"]))
+                viewer.frame(
+                    viewer.look(camera={"azimuth": float(azimuth)}, width=48, height=48, modes=["rendered"])
+                )
                 for _ in range(5)
             ]
 
@@ -215,7 +266,14 @@ def read_video(video: bytes):
 
 def test_a_path_becomes_a_video(ball):
     poses = [{"azimuth": 20.0 * n} for n in range(5)]
-    body = {"poses": poses, "times": [0, 0, 1, 1, 2], "fps": 10, "width": 64, "height": 48, "mode": "completed"}
+    body = {
+        "poses": poses,
+        "times": [0, 0, 1, 1, 2],
+        "fps": 10,
+        "width": 64,
+        "height": 48,
+        "mode": "completed",
+    }
     status, headers, video = get(f"{ball.url}/path.mp4", data=json.dumps(body).encode())
     assert status == 200 and headers["content-type"] == "video/mp4", video
     frames, fps = read_video(video)
@@ -231,7 +289,10 @@ def test_a_path_becomes_a_video(ball):
         *((body, "expected") for body in (b"", b"[]", b'{"poses": []}', b"x" * 1_100_000)),
         (b'{"poses": [{}], "times": [1, 2]}', "expected a time for each"),
         (b'{"poses": [{}], "stereo_m": -1}', "stereo_m: expected"),
-        (b'{"poses": [{}], "width": 1600, "height": 1000, "stereo_m": 0.06}', "expected at most 2100000 pixels"),
+        (
+            b'{"poses": [{}], "width": 1600, "height": 1000, "stereo_m": 0.06}',
+            "expected at most 2100000 pixels",
+        ),
     ],
 )
 def test_invalid_paths_are_refused(ball, body, said):
@@ -240,7 +301,9 @@ def test_invalid_paths_are_refused(ball, body, said):
 
 
 def test_one_path_at_a_time(ball):
-    body = json.dumps({"poses": [{"azimuth": 20.0 * n} for n in range(4)], "width": 32, "height": 32}).encode()
+    body = json.dumps(
+        {"poses": [{"azimuth": 20.0 * n} for n in range(4)], "width": 32, "height": 32}
+    ).encode()
     clients = [http.client.HTTPConnection("127.0.0.1", ball.port, timeout=60) for _ in range(3)]
     for client in clients:
         client.putrequest("POST", "/path.mp4")
@@ -257,7 +320,13 @@ def test_one_path_at_a_time(ball):
 
 
 def test_only_the_pages_own_files_are_served(ball):
-    for path in ("page/../server.py", "page/%2e%2e/server.py", "page//etc/passwd", "page/nothing.js", "etc/passwd"):
+    for path in (
+        "page/../server.py",
+        "page/%2e%2e/server.py",
+        "page//etc/passwd",
+        "page/nothing.js",
+        "etc/passwd",
+    ):
         status, _, body = get(f"{ball.url}/{path}")
         assert status == 404 and b"import" not in body
     files = ball.live._files
@@ -306,7 +375,9 @@ def test_a_failing_model_leaves_holes_and_recovers(said):
     with running(inpainter=model) as server, Client(server.ws) as viewer:
 
         def image():
-            return viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "completed"]
+            return viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[
+                0, "completed"
+            ]
 
         viewer.send("clock", seek=0, playing=False)
         good = image()

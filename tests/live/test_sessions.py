@@ -24,7 +24,9 @@ SPAN = Span(0, 20, 20, 10.0)
 class Desk:
     """A session, its clock, and the frames that are in memory."""
 
-    def __init__(self, budget_ms=None, has_frame=lambda index: True, ladder=CONTEXT_LADDER, span=SPAN, paused=False):
+    def __init__(
+        self, budget_ms=None, has_frame=lambda index: True, ladder=CONTEXT_LADDER, span=SPAN, paused=False
+    ):
         self.sent, self.errors, self.clock = [], [], FakeClock()
         self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms, ladder, self.clock)
         self.has_frame, self.span, self.edge, self.active_viewers = has_frame, span, 0.0, 1
@@ -229,7 +231,9 @@ def test_a_failure_is_reported_and_not_tried_again_before_something_changes():
     desk.look(id=1)
     desk.due()
     desk.session.fail("no")
-    assert desk.errors == ["no"] and desk.due(STILL_S) is None and desk.due(FULL_S) is None, "it is not refined"
+    assert desk.errors == ["no"] and desk.due(STILL_S) is None and desk.due(FULL_S) is None, (
+        "it is not refined"
+    )
     assert desk.due(edge=1.0) is not None
 
 
@@ -251,14 +255,20 @@ def test_the_header_describes_the_frame(ball_view, mode):
     request = desk.due()
     desk.session.deliver(
         request,
-        RenderResult(0, (ball_view,), State(), StageTimes(geometry=3.0, context=2.0, rendering=4.0, inpainting=5.0)),
+        RenderResult(
+            0, (ball_view,), State(), StageTimes(geometry=3.0, context=2.0, rendering=4.0, inpainting=5.0)
+        ),
     )
     header, parts = unpack(desk.sent[0])
     assert (header["look"], header["sent_ms"], header["frame"], header["full"]) == (5, 12.5, 0, True)
     assert [part["kind"] for part in header["parts"]] == ["image", "depth"] and parts[0][:2] == b"\xff\xd8"
     stages = header["stage_ms"]
     assert list(stages) == ["geometry", "context", "rendering", "inpainting", "encode", "wait", "total"]
-    assert (stages["geometry"], stages["inpainting"]) == (3, 5) and stages["encode"] > 0 and 0 < header["holes"] < 1
+    assert (
+        (stages["geometry"], stages["inpainting"]) == (3, 5)
+        and stages["encode"] > 0
+        and 0 < header["holes"] < 1
+    )
     assert stages["total"] == pytest.approx(14 + stages["encode"] + stages["wait"], abs=0.02)
     assert desk.session.stats_json(1)["stage_ms"] == stages
     assert header["colours"][0] == [230, 120, 60] and len(header["cameras"][0]["K"]) == 9

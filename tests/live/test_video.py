@@ -10,7 +10,10 @@ from live.live_servers import WAIT_S, open_websocket, running, say_hello
 from viewmend.live.protocol import unpack
 from viewmend.live.video import ENCODERS, STRINGS, VideoStream, video_codecs
 
-CODECS = [pytest.param(c, marks=pytest.mark.skipif(c not in video_codecs(), reason=f"no {c} here")) for c in ENCODERS]
+CODECS = [
+    pytest.param(c, marks=pytest.mark.skipif(c not in video_codecs(), reason=f"no {c} here"))
+    for c in ENCODERS
+]
 
 
 def image(step: int, width: int = 64, height: int = 48):
@@ -73,7 +76,13 @@ def test_a_viewer_chooses_a_codec():
         for codec in (*video_codecs(), "jpeg"):
             keys = []
             for key in (False, False, True):
-                look = {"type": "look", "codec": codec, "width": 48, "height": 48, "modes": ["rendered", "completed"]}
+                look = {
+                    "type": "look",
+                    "codec": codec,
+                    "width": 48,
+                    "height": 48,
+                    "modes": ["rendered", "completed"],
+                }
                 viewer.send(json.dumps(look | {"key": key}))
                 header, parts = next_frame(viewer)
                 assert [part["codec"] for part in header["parts"]] == [codec, codec]

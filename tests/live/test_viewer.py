@@ -58,7 +58,9 @@ def test_pages_show_what_the_program_wants():
         with connect(f"{address.replace('http', 'ws')}/ws?{query}", max_size=None) as socket:
             assert say_hello(socket)["model"] == "SmoothFill"
             shown = messages(socket, "show")
-            assert next(shown) == {"type": "show", "pose": {"azimuth": 30.0}, "mode": "rendered"}, "it was shown before"
+            assert next(shown) == {"type": "show", "pose": {"azimuth": 30.0}, "mode": "rendered"}, (
+                "it was shown before"
+            )
             viewer.show(camera=CAMERAS[2], time=1)
             later = next(shown)
             assert later["time"] == 1 and len(later["pose"]["R"]) == 9 and len(later["pose"]["T"]) == 3
@@ -79,7 +81,9 @@ def test_pages_show_what_the_program_wants():
 async def test_what_is_shown_while_the_first_page_opens_reaches_it():
     """The program sets it on its own thread, perhaps just after the page was informed."""
     source = Mock(span=Span(), status=SourceStatus())
-    service = Mock(spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0)
+    service = Mock(
+        spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0
+    )
     registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
     page.inform.side_effect = lambda shared: shown.append(shared.show) or math.inf
     registry.join(page)

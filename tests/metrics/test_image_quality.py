@@ -42,7 +42,10 @@ def test_colours_that_are_not_finite_are_not_hidden(pair):
 
 @pytest.mark.parametrize(
     ("window", "options"),
-    [("gaussian", {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}), ("uniform7", {})],
+    [
+        ("gaussian", {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}),
+        ("uniform7", {}),
+    ],
 )
 def test_ssim_matches_scikit_image(pair, window, options):
     image, truth = (t.double().numpy() for t in pair)
@@ -54,7 +57,9 @@ def test_ssim_matches_scikit_image(pair, window, options):
 def test_the_ssim_map_matches_torchmetrics(pair):
     image, truth = (t[None].double() for t in pair)
     # torchmetrics also returns windows over a mirrored border.
-    _, full = structural_similarity_index_measure(image, truth, sigma=1.5, data_range=1.0, return_full_image=True)
+    _, full = structural_similarity_index_measure(
+        image, truth, sigma=1.5, data_range=1.0, return_full_image=True
+    )
     own = ssim_map(*pair)
     torch.testing.assert_close(own[5:-5, 5:-5], full[0, :, 5:-5, 5:-5].mean(0), rtol=0, atol=1e-5)
     assert int(own.isfinite().sum()) == 30 * 38, "windows inside the image"

@@ -66,7 +66,9 @@ def test_published_values():
         except MissingWeightsError:
             continue  # VGG16 is optional
         with torch.no_grad():
-            assert metric(pair, torch.from_numpy(a).expand(2, -1, -1, -1)).tolist() == pytest.approx(values, abs=2e-6)
+            assert metric(pair, torch.from_numpy(a).expand(2, -1, -1, -1)).tolist() == pytest.approx(
+                values, abs=2e-6
+            )
 
 
 def test_it_is_a_training_loss(rng):

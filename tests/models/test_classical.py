@@ -46,7 +46,9 @@ def test_the_blend_is_the_formula_inside_and_a_copy_outside(rng):
     E = torch.rand(6, 6, generator=rng) * (torch.rand(6, 6, generator=rng) > 0.5)
     coverage = (torch.rand(6, 6, generator=rng) > 0.2).float()
     completed = blend(F, E, filled, coverage)
-    assert torch.allclose(completed[:, coverage == 1], (E * filled + (1 - E) * F)[:, coverage == 1], atol=1e-6)
+    assert torch.allclose(
+        completed[:, coverage == 1], (E * filled + (1 - E) * F)[:, coverage == 1], atol=1e-6
+    )
     untouched = (E == 0) | (coverage == 0)
     assert torch.equal(completed[:, untouched], F[:, untouched])
     known, half, bright = torch.zeros(3, 2, 2), torch.full((2, 2), 0.5), torch.full((3, 2, 2), 1.6)
@@ -81,7 +83,9 @@ def test_the_nearest_colour_is_that_of_a_nearest_pixel_of_the_subject(view):
     right = ((view.error == 0) & (view.mask > 0)).nonzero().float()
     for place in (view.error == 1).nonzero():
         distance = (right - place).norm(dim=1)
-        nearest = right[distance < distance.min() + 0.1].long()  # OpenCV's distances are good to a twentieth of a pixel
+        nearest = right[
+            distance < distance.min() + 0.1
+        ].long()  # OpenCV's distances are good to a twentieth of a pixel
         colours = view.rgb[:, nearest[:, 0], nearest[:, 1]]
         assert (colours - got[:, place[0], place[1]][:, None]).abs().amax(0).min() < 1e-6
 

@@ -43,5 +43,7 @@ def test_excluded_cameras_are_never_provided():
 
 
 def test_a_string_is_not_taken_for_a_list_of_names():
-    with pytest.raises(ValueError, match=r"exclude as a list of names, got the string 'left'; write \['left'\]"):
+    with pytest.raises(
+        ValueError, match=r"exclude as a list of names, got the string 'left'; write \['left'\]"
+    ):
         ContextProvider(Rig(), exclude="left")

@@ -43,7 +43,9 @@ def carry(now_depth):
     now = replace(now, depth=now.depth / DISTANCE_M * now_depth)
     past, now = encode(net, context(2))[0], encode(net, now)[0]
     none = torch.zeros(0, 3, dtype=torch.long)
-    target = Target(view=view(5), places=none, tokens=torch.zeros(0, 64), incomplete=torch.zeros(0, dtype=torch.bool))
+    target = Target(
+        view=view(5), places=none, tokens=torch.zeros(0, 64), incomplete=torch.zeros(0, dtype=torch.bool)
+    )
     batch = collate([target], [[past, now]], [past.keys_values[:, :, :0]], net.config)
     n = len(past.tokens)
     return past, batch.context_at.uvs[0, :n], batch.context_at.present[0, :n]
@@ -62,7 +64,9 @@ def test_past_patches_are_carried_by_the_current_geometry():
 def test_a_frame_lifted_by_another_has_points_only_where_that_one_has_depth():
     places, uv = torch.tensor([[0, 0], [0, 1], [1, 0], [5, 5]]), torch.rand(4, 2) * 40
     at, valid, memory = camera_at(10, "c"), torch.ones(4, dtype=torch.bool), torch.zeros(1, 2, 4, 8)
-    older = ContextFrame(at, 3, places, uv, torch.zeros(4, 3), valid, torch.ones(6, 6), torch.zeros(4, 8), memory)
+    older = ContextFrame(
+        at, 3, places, uv, torch.zeros(4, 3), valid, torch.ones(6, 6), torch.zeros(4, 8), memory
+    )
     now = replace(older, time=4, depths=torch.tensor([[2.0, 0.0], [1.5, 3.0]]))
     points, lifted = older.lifted_by(now)
     assert lifted.tolist() == [True, False, True, False]

@@ -39,7 +39,9 @@ def test_errors_are_predicted_on_the_proxy_and_its_rim(scene, net):
         assert image.shape == view.mask.shape and not bool(image[~there].any())
         assert float(image[there].min()) > 0 and float(image.max()) < 1 and float(image[there].std()) > 1e-3
     assert not torch.equal(net.errors(replace(view, rgb=0 * view.rgb), sources).wrong, found.wrong)
-    assert torch.equal(net.errors(replace(view, error=0 * view.error), sources).wrong, found.wrong), "E is not an input"
+    assert torch.equal(net.errors(replace(view, error=0 * view.error), sources).wrong, found.wrong), (
+        "E is not an input"
+    )
 
 
 @torch.no_grad()
@@ -58,7 +60,9 @@ def test_a_large_subject_is_judged_at_half_the_resolution_if_nothing_is_predicte
 
 def test_holes_and_the_highest_gains_are_selected(scene):
     _, view, _ = scene
-    gain = torch.rand(view.mask.shape, generator=torch.Generator().manual_seed(0)) * (rim_depth(view.depth) > 0)
+    gain = torch.rand(view.mask.shape, generator=torch.Generator().manual_seed(0)) * (
+        rim_depth(view.depth) > 0
+    )
     hull, holes = int((view.mask > 0).sum()), view.holes
     error = select_by_gain(view, gain, 0.3)
     chosen = error > 0
@@ -66,7 +70,9 @@ def test_holes_and_the_highest_gains_are_selected(scene):
     assert bool(chosen[holes].all()) and float(gain[chosen & ~holes].min()) >= float(gain[~chosen].max())
     assert set(error.unique().tolist()) == {0.0, 1.0}
     assert torch.equal(select_by_gain(view, gain, 1e-6) > 0, holes), "though these are more"
-    assert torch.equal(select_by_gain(view, 1e-5 * gain, 0.3) > 0, holes), "pixels that hardly change are left"
+    assert torch.equal(select_by_gain(view, 1e-5 * gain, 0.3) > 0, holes), (
+        "pixels that hardly change are left"
+    )
 
 
 def test_background_is_attenuated_and_not_predicted(scene):
@@ -92,7 +98,9 @@ def test_background_is_attenuated_and_not_predicted(scene):
     dark, _ = stream.inpainter.step(faded, ContextProvider(lambda *_: None), State())
     torch.testing.assert_close(dark.rgb, (1 - part.fade) * view.rgb)
     assert dark.alpha is not None and torch.equal(dark.alpha, (1 - part.fade) * view.mask)
-    half = attenuate_background(replace(view, error=0.5 * view.error), ErrorMap(rest, rest, 0 * alpha, rest), 0.3)
+    half = attenuate_background(
+        replace(view, error=0.5 * view.error), ErrorMap(rest, rest, 0 * alpha, rest), 0.3
+    )
     assert float(half.error.max()) == 0.5, "never more than E"
     crop = Crop(16, 16, 80, 83)
     around = crop.uncropped(crop.of_view(part), view.camera)
@@ -119,7 +127,10 @@ def test_a_quality_limits_the_predicted_part(scene, net):
     def completed(rule, fraction, **more):
         own = stream_of(net, scene, error_rule=rule, refine_fraction=0.5)
         quality = RenderQuality(refine_fraction=fraction, **more)
-        return [one.completed.view for one in (own.view(view.camera, quality=quality), own.mend(view, quality=quality))]
+        return [
+            one.completed.view
+            for one in (own.view(view.camera, quality=quality), own.mend(view, quality=quality))
+        ]
 
     for rule, allowed, most in [("all", 0.4, 0.4), ("predicted", 0.4, 0.4), ("predicted", 0.9, 0.5)]:
         rendered, given = (int(one.refine_mask.sum()) for one in completed(rule, allowed))
@@ -138,7 +149,9 @@ def test_if_nothing_is_predicted_holes_are_filled_from_their_surroundings(scene,
     assert part.fade is not None and completed.confidence is not None and int((part.fade > 0).sum()) > 20
     assert torch.equal(part.refine_mask, view.holes) and bool(view.holes.any())
     torch.testing.assert_close(completed.rgb[:, view.holes], filled[:, view.holes], atol=1e-3, rtol=0)
-    torch.testing.assert_close(completed.rgb[:, rest], ((1 - part.error) * view.rgb)[:, rest], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        completed.rgb[:, rest], ((1 - part.error) * view.rgb)[:, rest], atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(completed.opacity[rest], ((1 - part.error) * view.mask)[rest])
     assert not bool(completed.confidence[view.holes].any())
     assert bool((completed.confidence[rest] == view.mask[rest]).all())

@@ -30,7 +30,10 @@ SHAPES = [(70, 53), (64, 96), (33, 161), (17, 9)]
 def test_detail_is_what_pixels_have_around_weighted_local_means(grad, rng):
     shape, (finest, coarser) = torch.Size((9, 14)), (side // 2 for side in BAND_PX)
     pixels = torch.nonzero(torch.rand(shape, generator=rng) < 0.6)
-    colours, weight = torch.rand(len(pixels), 2, 3, generator=rng), 0.01 + torch.rand(len(pixels), generator=rng)
+    colours, weight = (
+        torch.rand(len(pixels), 2, 3, generator=rng),
+        0.01 + torch.rand(len(pixels), generator=rng),
+    )
     with torch.set_grad_enabled(grad):  # both implementations
         bands = detail_bands(colours, weight, pixels, shape)
     for n, (row, column) in enumerate(pixels.tolist()):
@@ -45,7 +48,10 @@ def test_detail_is_what_pixels_have_around_weighted_local_means(grad, rng):
 def test_a_downsampled_view_has_the_means_of_covered_pixels(scene):
     _, view, _ = scene
     small, (height, width) = downsample2x(view), view.mask.shape
-    assert small.mask.shape == (math.ceil(height / 2), math.ceil(width / 2)) and small.source_views == view.source_views
+    assert (
+        small.mask.shape == (math.ceil(height / 2), math.ceil(width / 2))
+        and small.source_views == view.source_views
+    )
     partly = 0
     for row in range(small.mask.shape[0]):
         for column in range(small.mask.shape[1]):
@@ -58,7 +64,9 @@ def test_a_downsampled_view_has_the_means_of_covered_pixels(scene):
                 assert small.depth[row, column] == view.depth[cell][covered].min()
                 partly += not covered.all()
     assert partly > 20
-    point = view.camera.centers[0] + 2.0 * view.camera.world_from_camera[0, :3, 2] + torch.tensor([0.1, 0.2, 0.0])
+    point = (
+        view.camera.centers[0] + 2.0 * view.camera.world_from_camera[0, :3, 2] + torch.tensor([0.1, 0.2, 0.0])
+    )
     (one, _), (other, _) = (project(point[None], each.camera) for each in (view, small))
     assert torch.allclose(one / 2, other, atol=1e-4), "the same rays"
 
@@ -135,4 +143,6 @@ def test_cells_at_pixels_equal_an_upsampled_image(shape, rng):
     image = scatter_to_image(torch.cat([values, torch.ones(len(cells), 1)], 1), cells, size)
     image = F.interpolate(image[None], scale_factor=CELL_PX, mode="bilinear")[0]
     at = image[:, pixels[:, 0], pixels[:, 1]].T
-    torch.testing.assert_close(distribution.interpolate(values, pixels), at[:, :-1] / at[:, -1:].clamp_min(1e-6))
+    torch.testing.assert_close(
+        distribution.interpolate(values, pixels), at[:, :-1] / at[:, -1:].clamp_min(1e-6)
+    )

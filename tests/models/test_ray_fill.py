@@ -47,12 +47,16 @@ def test_known_pixels_stay_and_a_step_blends_the_rest():
     net, incomplete, missing = tiny_rays(), view(5), view(5).error > 0
     filled = net(incomplete, SourceCameras.of(context(5, ("left", "right", "third")), None))
     assert torch.equal(filled[:, ~missing], incomplete.rgb[:, ~missing])
-    assert float(filled.min()) >= 0 and float(filled.max()) <= 1 and not torch.equal(filled, smooth(incomplete))
+    assert (
+        float(filled.min()) >= 0 and float(filled.max()) <= 1 and not torch.equal(filled, smooth(incomplete))
+    )
     candidates = replace(incomplete, candidate_views=("third", "left", "novel", "right"))
     rig = Rig()
     completed, _ = net.step(candidates, rig, net.initial_state())
     assert rig.asked[0] == (5, ("left", "right", "third")), "the source views, then the closest others"
-    assert torch.equal(completed.rgb, blend(incomplete.rgb, incomplete.error, filled, torch.ones_like(incomplete.mask)))
+    assert torch.equal(
+        completed.rgb, blend(incomplete.rgb, incomplete.error, filled, torch.ones_like(incomplete.mask))
+    )
     whole, rig = view(5, hole=None), Rig()
     assert net.step(whole, rig, net.initial_state())[0].rgb is whole.rgb and not rig.asked
 
@@ -69,7 +73,9 @@ def test_depth_in_holes_is_optional():
     for odd in (flat, maskless):
         assert net.step(odd, Rig(), net.initial_state())[0].rgb.isfinite().all()
     blind = net.step(incomplete, ContextProvider(lambda *_: None), net.initial_state())[0]
-    assert torch.allclose(blind.rgb, net(incomplete, None) * incomplete.error + (1 - incomplete.error) * incomplete.rgb)
+    assert torch.allclose(
+        blind.rgb, net(incomplete, None) * incomplete.error + (1 - incomplete.error) * incomplete.rgb
+    )
 
 
 @torch.no_grad()

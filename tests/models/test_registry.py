@@ -89,7 +89,10 @@ def test_a_class_need_not_take_the_device(tmp_path):
         *(("{}:Other", "check FILE.py:NAME"), ("{}:number", "check FILE.py:NAME")),
         ("absent.py:Mine", "check the path"),
         ("{}:Bare", r"own\.py:Bare: expected an inpainter, got Bare; make its class a subclass"),
-        ("{}:Demanding", r"Demanding: expected .* no argument but the device, got .*fading\); give the others"),
+        (
+            "{}:Demanding",
+            r"Demanding: expected .* no argument but the device, got .*fading\); give the others",
+        ),
     ],
 )
 def test_names_that_a_file_does_not_have_and_other_classes_are_refused(name, message, tmp_path):

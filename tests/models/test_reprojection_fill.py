@@ -35,7 +35,9 @@ def test_without_cameras_it_fills_smoothly_and_without_holes_it_asks_nobody():
     inpainter, rig, incomplete = ReprojectionFill(), Rig(start=1000), view(5)
     completed, _ = inpainter.step(incomplete, rig, inpainter.initial_state())
     hard = incomplete.error == 1
-    assert torch.equal(completed.rgb[:, hard], fill(incomplete.rgb, incomplete.error > 0, incomplete.mask > 0)[:, hard])
+    assert torch.equal(
+        completed.rgb[:, hard], fill(incomplete.rgb, incomplete.error > 0, incomplete.mask > 0)[:, hard]
+    )
     rig.asked.clear()
     whole = view(5, hole=None)
     assert inpainter.step(whole, rig, inpainter.initial_state())[0].rgb is whole.rgb and not rig.asked

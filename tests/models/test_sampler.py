@@ -57,7 +57,9 @@ def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
     incomplete, seen = view(5), context(5, ("left", "third", "right"))
     depth = seen.depth + 0.2 * torch.rand(seen.depth.shape, generator=rng) * (seen.depth > 0)
     masks = (torch.rand(depth.shape, generator=rng) * 256).byte()
-    seen = replace(seen, frame=replace(seen.frame, cameras=rotated(seen.frame.cameras, 0.55), mask=masks), depth=depth)
+    seen = replace(
+        seen, frame=replace(seen.frame, cameras=rotated(seen.frame.cameras, 0.55), mask=masks), depth=depth
+    )
     rig = context(5, ("left", "third", "right", "novel")).frame
     outlines = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 64).byte()
     incomplete = replace(incomplete, silhouettes=Silhouettes(outlines, rotated(rig.cameras, 0.55)))
@@ -65,7 +67,9 @@ def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
     sources = SourceCameras.of(seen, incomplete.silhouettes)
     samples = sample_behind_proxy(incomplete, pixels, sources)
-    features, smallest = sample_fill_reference(incomplete, pixels, seen, FILL_OFFSETS, NEAR, FAR, AROUND, PATCH)
+    features, smallest = sample_fill_reference(
+        incomplete, pixels, seen, FILL_OFFSETS, NEAR, FAR, AROUND, PATCH
+    )
     assert 0 < CameraFeatures.unstack(samples.features).in_view.mean() < 1, "some samples are out of view"
     assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=3e-3)
     assert torch.allclose(samples.statistics[..., -4:].double(), torch.from_numpy(smallest), atol=2e-3)
@@ -92,7 +96,9 @@ def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
 
 def test_cubic_samples_keep_straight_lines_and_overshoot_none(rng):
     ramp = (10 * torch.arange(12.0))[None, None, None].expand(1, 1, 9, 12).contiguous()
-    at = Projections(*(5 + 2 * torch.rand(40, 1, 1, dtype=torch.double, generator=rng) for _ in range(3)), None)
+    at = Projections(
+        *(5 + 2 * torch.rand(40, 1, 1, dtype=torch.double, generator=rng) for _ in range(3)), None
+    )
     levels = MipLevels.full(ramp)
     found = sample_level_cubic(levels, at, 1)
     assert torch.allclose(found, sample_level(levels, at, 1), atol=1e-5)
@@ -114,7 +120,10 @@ def test_levels_are_means_with_a_black_border():
     image = torch.zeros(7, 9, 1, dtype=torch.uint8)
     image[1:-1, 1:-1, 0] = torch.randint(0, 256, (5, 7), dtype=torch.uint8)
     half, inner = downsample2x(image), image[..., 0].int()
-    assert half.shape == (5, 6, 1) and int(half[0].sum() + half[-1].sum() + half[:, 0].sum() + half[:, -1].sum()) == 0
+    assert (
+        half.shape == (5, 6, 1)
+        and int(half[0].sum() + half[-1].sum() + half[:, 0].sum() + half[:, -1].sum()) == 0
+    )
     assert int(half[1, 1, 0]) == (int(inner[1:3, 1:3].sum()) + 2) // 4
     assert int(half[3, 4, 0]) == (int(inner[5, 7]) + 2) // 4, "an odd side is completed with black"
 
@@ -126,8 +135,12 @@ def test_levels_match_the_footprint_of_a_ray():
     (pyramid,) = silhouette_pyramids(Silhouettes(mask, cameras))
     assert pyramid.subject_px == pytest.approx(32)
     last, subject_px = torch.tensor([len(pyramid.levels) - 1]), torch.tensor([100.0])
-    scale = SceneScale(1.0, 2.0)  # the viewer stands where the camera is: footprints are as large as rays are apart
-    chosen = [choose_levels(cameras, last, subject_px, cameras, px, scale) for px in (0.3, 1.0, 1.5, 4.0, 1e9)]
+    scale = SceneScale(
+        1.0, 2.0
+    )  # the viewer stands where the camera is: footprints are as large as rays are apart
+    chosen = [
+        choose_levels(cameras, last, subject_px, cameras, px, scale) for px in (0.3, 1.0, 1.5, 4.0, 1e9)
+    ]
     assert [int(fine) for fine, _ in chosen] == [0, 0, 1, 2, int(last)]
     assert [int(wide) for _, wide in chosen] == [3, 3, 3, 3, int(last)]
 
@@ -135,7 +148,10 @@ def test_levels_match_the_footprint_of_a_ray():
 def test_without_silhouettes_the_source_masks_count():
     incomplete, seen = view(5), context(5)
     pixels = torch.nonzero(incomplete.error > 0)[::20]
-    parts = SourceCameras.of(seen, None), SourceCameras.of(seen, Silhouettes(seen.frame.mask, seen.frame.cameras))
+    parts = (
+        SourceCameras.of(seen, None),
+        SourceCameras.of(seen, Silhouettes(seen.frame.mask, seen.frame.cameras)),
+    )
     without, given = (sample_behind_proxy(incomplete, pixels, part).statistics for part in parts)
     assert torch.equal(without, given)
 
@@ -169,7 +185,9 @@ def samples():
     features = torch.rand(150, 3, 5, FEATURES) * seen[..., None]
     features[..., IN_VIEW] = seen
     prior = torch.rand(150, 3, 5) * seen
-    return RaySamples(features, prior / prior.sum(2, keepdim=True).clamp_min(1e-6), torch.rand(150, 3, STATISTICS))
+    return RaySamples(
+        features, prior / prior.sum(2, keepdim=True).clamp_min(1e-6), torch.rand(150, 3, STATISTICS)
+    )
 
 
 @pytest.mark.parametrize("own_prior", [True, False])
@@ -179,10 +197,14 @@ def test_the_compiled_loop_equals_pytorch(samples, own_prior):
     before = [part.clone() for part in samples]
     with torch.no_grad():
         fast = net(samples, prior)
-    assert all(torch.equal(part, old) for part, old in zip(samples, before, strict=True)), "inputs are not changed"
+    assert all(torch.equal(part, old) for part, old in zip(samples, before, strict=True)), (
+        "inputs are not changed"
+    )
     slow = net(samples, prior)
     for name, own, wanted in zip(fast._fields, fast, slow, strict=True):
-        torch.testing.assert_close(own, wanted.detach(), atol=1e-5, rtol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(
+            own, wanted.detach(), atol=1e-5, rtol=1e-5, msg=lambda m, name=name: f"{name}: {m}"
+        )
     seen = samples.features[..., IN_VIEW]
     assert not bool(fast.trust[seen == 0].any())
     torch.testing.assert_close(fast.trust.sum(2), seen.amax(2), atol=1e-5, rtol=0)
@@ -230,7 +252,9 @@ def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
     _, view, sources = scene
     monkeypatch.setattr(SourceCameras, "use_kernels", kernels)
     rays = rays_of(view)
-    features = CameraFeatures.unstack(sample_rays_torch(rays, sources, 2.0).features[..., : sum(CAMERA_CHANNELS)])
+    features = CameraFeatures.unstack(
+        sample_rays_torch(rays, sources, 2.0).features[..., : sum(CAMERA_CHANNELS)]
+    )
     weight = (4 * features.viewing_cosine).exp() / (1 + (6 * features.depth_difference).exp())
     scores = (features.in_view * weight).sum((1, 3))
     chosen = choose_cameras(rays, sources, 2)

@@ -33,7 +33,9 @@ def test_only_e_changes(scene):
     kept = error == 0
     assert torch.equal(completed.rgb[:, kept], view.rgb[:, kept])
     assert bool((completed.rgb[:, ~kept] != view.rgb[:, ~kept]).any())
-    assert torch.equal(completed.alpha[kept], view.mask[kept]) and torch.equal(completed.depth[kept], view.depth[kept])
+    assert torch.equal(completed.alpha[kept], view.mask[kept]) and torch.equal(
+        completed.depth[kept], view.depth[kept]
+    )
     for image in (completed.rgb, completed.alpha, completed.confidence):
         assert float(image.min()) >= 0 and float(image.max()) <= 1 + 1e-6
     assert float(completed.confidence[kept & (view.mask == 0)].abs().max()) == 0
@@ -45,7 +47,9 @@ def test_only_e_changes(scene):
 
 def test_soft_e_blends(scene):
     stream, view, _ = scene
-    whole, half, none = (stream.mend(replace(view, error=share * view.error)).completed for share in (1.0, 0.5, 0.0))
+    whole, half, none = (
+        stream.mend(replace(view, error=share * view.error)).completed for share in (1.0, 0.5, 0.0)
+    )
     torch.testing.assert_close(half.rgb, (whole.rgb + view.rgb) / 2)
     torch.testing.assert_close(half.alpha, (whole.alpha + view.mask) / 2)
     assert none.rgb is view.rgb and none.alpha is None
@@ -70,7 +74,9 @@ def test_colours_come_from_the_source_cameras(scene):
     frame = replace(sources.views.frame, rgb=green)
     other = SourceCameras.of(replace(sources.views, frame=frame), view.silhouettes)
     found = stream.inpainter(replace(view, rgb=torch.zeros_like(view.rgb)), other)
-    assert float(found.rgb[:, 0].max()) == 0 and float(found.rgb[:, 1].mean()) > 5 * float(found.rgb[:, 2].max())
+    assert float(found.rgb[:, 0].max()) == 0 and float(found.rgb[:, 1].mean()) > 5 * float(
+        found.rgb[:, 2].max()
+    )
 
 
 @torch.no_grad()
@@ -80,7 +86,9 @@ def test_colours_of_holes_do_not_exceed_alpha(scene):
     found = found._replace(alpha=0.5 * found.alpha, rgb=0.5 * found.rgb)
     open_view = replace(view, weights=torch.zeros_like(view.weights))
     completed = found.composite_into(open_view, predicted, ~predicted, torch.ones_like(view.rgb))
-    assert bool((completed.rgb <= completed.alpha).all()) and int((completed.rgb == completed.alpha).sum()) > 500
+    assert (
+        bool((completed.rgb <= completed.alpha).all()) and int((completed.rgb == completed.alpha).sum()) > 500
+    )
 
 
 def test_without_cameras_the_view_stays(scene):
@@ -114,7 +122,9 @@ def test_all_implementations_predict_the_same_from_the_cameras_chosen_for_each_r
         assert float((other.rgb.detach() - fast.rgb).abs().amax(1).quantile(0.99)) < 1e-3
 
 
-@pytest.mark.parametrize("values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}])
+@pytest.mark.parametrize(
+    "values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}]
+)
 def test_impossible_sizes_are_refused(values):
     with pytest.raises(ValueError, match="expected"):
         ViewsConfig.from_dict(values)
@@ -144,7 +154,9 @@ def test_the_rim_is_predicted_too(scene):
     found = stream.inpainter(view, sources)
     assert int(rim[tuple(found.pixels.T)].sum()) == int(rim.sum())
     completed = stream.mend(view).completed
-    assert bool((completed.alpha[rim] > 0).all()) and not bool((completed.alpha[~rim & (view.mask == 0)] > 0).any())
+    assert bool((completed.alpha[rim] > 0).all()) and not bool(
+        (completed.alpha[~rim & (view.mask == 0)] > 0).any()
+    )
 
 
 def test_pyramids_of_a_frame_are_computed_once_for_all_views(scene, monkeypatch):
@@ -155,7 +167,9 @@ def test_pyramids_of_a_frame_are_computed_once_for_all_views(scene, monkeypatch)
     monkeypatch.setattr(pyramids, "downsample2x", lambda image: halvings.append(image.shape) or whole(image))
     first = stream.mend(view).completed
     made = len(halvings)
-    assert made > 4 and cached.size > before + 1.3 * view.silhouettes.mask.numel(), "and its memory is counted"
+    assert made > 4 and cached.size > before + 1.3 * view.silhouettes.mask.numel(), (
+        "and its memory is counted"
+    )
     assert torch.equal(stream.mend(view).completed.rgb, first.rgb) and len(halvings) == made
     stream.mend(replace(view, candidate_views=view.candidate_views[::-1]))
     assert made < len(halvings) < 2 * made, "only the camera that no view needed before"
@@ -207,5 +221,10 @@ def test_remains_of_phantoms_are_removed_from_all_images(scene, monkeypatch):
     there[30:40, 30:40] = True
     monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: there & predicted)
     after, gone = stream.mend(view).completed, there & (view.error > 0)
-    assert bool(gone.any()) and all(float(image[..., gone].abs().max()) == 0 for image in after.images.values())
-    assert all(torch.equal(image[..., ~gone], before.images[name][..., ~gone]) for name, image in after.images.items())
+    assert bool(gone.any()) and all(
+        float(image[..., gone].abs().max()) == 0 for image in after.images.values()
+    )
+    assert all(
+        torch.equal(image[..., ~gone], before.images[name][..., ~gone])
+        for name, image in after.images.items()
+    )

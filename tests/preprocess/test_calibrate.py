@@ -20,7 +20,14 @@ from viewmend.geometry.cameras import project
 from viewmend.preprocess.calibration import silhouettes as held_out
 from viewmend.preprocess.calibration.board import Corners, parse_board
 from viewmend.preprocess.calibration.bundle import calibrate
-from viewmend.preprocess.calibration.silhouettes import HOLDS, HeldOutIou, Refinement, best_hold, brought_to, missed_px
+from viewmend.preprocess.calibration.silhouettes import (
+    HOLDS,
+    HeldOutIou,
+    Refinement,
+    best_hold,
+    brought_to,
+    missed_px,
+)
 from viewmend.studio.rigs import ring_rig
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -47,7 +54,9 @@ def film(folder, cameras, board, count, yaw_rad=np.pi, bent=BENT, seed=0):
 
 def over_the_stage_px(found, cameras):
     """How far points of the whole stage are from where the true cameras see them, mean of each camera."""
-    points = torch.from_numpy(np.random.default_rng(1).uniform([-0.7, 0, -0.7], [0.7, 1.9, 0.7], (1000, 3))).float()
+    points = torch.from_numpy(
+        np.random.default_rng(1).uniform([-0.7, 0, -0.7], [0.7, 1.9, 0.7], (1000, 3))
+    ).float()
     seen = project(points, brought_to(found, cameras, points))[0]
     return (seen - project(points, cameras)[0]).norm(dim=-1).mean(1)
 
@@ -65,9 +74,13 @@ def test_cameras_are_found_and_written(filmed, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["calibrate", str(folder), str(out), "--board", SMALL_BOARD, "--every", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
-    assert list(figures) == list(rig.names) and all(f["rms_px"] < 0.3 and f["images"] > 5 for f in figures.values())
+    assert list(figures) == list(rig.names) and all(
+        f["rms_px"] < 0.3 and f["images"] > 5 for f in figures.values()
+    )
     calibration = read_calibration(out)
-    assert calibration.cameras[1].image == f"{rig.names[1]}/{{frame}}.png" and len(calibration.frames) == TIMES
+    assert (
+        calibration.cameras[1].image == f"{rig.names[1]}/{{frame}}.png" and len(calibration.frames) == TIMES
+    )
     assert over_the_stage_px(pinhole_cameras(calibration.cameras), rig).mean() < 1.0
     baseline_m = np.linalg.norm(calibration.cameras[1].t_m)
     assert baseline_m == pytest.approx(float((rig.centers[1] - rig.centers[0]).norm()), rel=0.005)
@@ -89,7 +102,10 @@ WRONG = {
     "words": (["--board", "8x6"], "COLUMNSxROWS:SQUARE_M:MARKER_M"),
     "markers": (["--board", "8x6:0.1:0.2"], "markers smaller than squares"),
     "dictionary": (["--board", BOARD, "--dictionary", "5X5"], "a dictionary of OpenCV"),
-    "another dictionary": (["--board", BOARD, "--dictionary", "DICT_4X4_50"], "in 5 images or more, found it in 0"),
+    "another dictionary": (
+        ["--board", BOARD, "--dictionary", "DICT_4X4_50"],
+        "in 5 images or more, found it in 0",
+    ),
     "every": (["--board", BOARD, "--every", "0"], "--every of at least 1"),
     "nothing": ([], "either --board or --silhouettes"),
 }
@@ -117,7 +133,9 @@ def test_cameras_that_never_share_a_time_are_named():
         seen_from = eye @ pose
         pixels = cv2.projectPoints(board.corners_m, seen_from[:, :3], seen_from[:, 3], K, BENT)[0][:, 0]
         seen[time % 2, time] = Corners(np.arange(len(pixels)), pixels)
-    with pytest.raises(ValueError, match="camera 'b': expected the board in it and in another camera at the same time"):
+    with pytest.raises(
+        ValueError, match="camera 'b': expected the board in it and in another camera at the same time"
+    ):
         calibrate(seen, board, ["a", "b"], [(320, 384)] * 2)
 
 
@@ -174,12 +192,16 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
     lines = capsys.readouterr().out.splitlines()
     assert "outlines  missed_px 0.9, refined_px 0.1" in lines and len(lines) == 4
     shutil.copy(tmp_path / "out" / "cameras.json", folder / "cameras.json")
-    assert torch.allclose(open_capture(folder).cameras.camera_from_world, cameras.camera_from_world, atol=1e-5)
+    assert torch.allclose(
+        open_capture(folder).cameras.camera_from_world, cameras.camera_from_world, atol=1e-5
+    )
     assert open_capture(folder).read(1).mask is not None, "it goes where the old one was"
 
 
 def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(held_out, "refine_by_silhouettes", lambda frames, *_: Refinement(frames[0].cameras, 0.1, 0.1))
+    monkeypatch.setattr(
+        held_out, "refine_by_silhouettes", lambda frames, *_: Refinement(frames[0].cameras, 0.1, 0.1)
+    )
     monkeypatch.setattr(held_out, "best_hold", lambda *_: HOLDS[0])
     arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]
     assert main(arguments) == 2

@@ -32,7 +32,9 @@ def shape(x: int = 70) -> np.ndarray:
 def image(background: np.ndarray, inside: np.ndarray, noise: float = 3.0, seed: int = 1) -> np.ndarray:
     """A red subject before the background, with a camera's noise."""
     rgb = np.where(inside[..., None], np.uint8([190, 40, 50]), background).astype(float)
-    return (rgb + np.random.default_rng(seed).normal(0, noise, rgb.shape)).round().clip(0, 255).astype(np.uint8)
+    return (
+        (rgb + np.random.default_rng(seed).normal(0, noise, rgb.shape)).round().clip(0, 255).astype(np.uint8)
+    )
 
 
 def iou(mask: np.ndarray, inside: np.ndarray) -> float:

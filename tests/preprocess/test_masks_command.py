@@ -30,7 +30,9 @@ def unmasked(plain):
         for frame in plain.description["frames"]:
             mask = cv2.resize(plain.get(f"truth/{camera['name']}_{frame}.png"), SIZE) > 127
             plain.put(f"truth/{camera['name']}_{frame}.png", mask.astype(np.uint8) * 255)
-            image = np.where(mask[..., None], np.uint8([30, 30, 190]), stage) + rng.normal(0, 2, (*SIZE[::-1], 3))
+            image = np.where(mask[..., None], np.uint8([30, 30, 190]), stage) + rng.normal(
+                0, 2, (*SIZE[::-1], 3)
+            )
             plain.put(camera["image"].format(frame=frame), image.clip(0, 255).astype(np.uint8))
     plain.save()
     return plain
@@ -98,7 +100,9 @@ def test_a_screen_is_keyed(unmasked, tmp_path):
     for name in "abcd":
         for frame in ("000", "001"):
             mask = unmasked.get(f"truth/{name}_{frame}.png")[..., None] > 127
-            unmasked.put(f"images/{name}_{frame}.png", np.where(mask, np.uint8([90, 90, 90]), np.uint8([60, 160, 30])))
+            unmasked.put(
+                f"images/{name}_{frame}.png", np.where(mask, np.uint8([90, 90, 90]), np.uint8([60, 160, 30]))
+            )
     out = tmp_path / "out"
     assert main(["masks", str(unmasked.path), str(out), "--method", "chroma", "--images", "png"]) == 0
     frame = open_capture(out).read(0)
@@ -129,7 +133,9 @@ def test_whoever_needs_masks_hears_of_the_command(unmasked, tmp_path, capsys):
     assert "none (viewmend masks makes them)" in capsys.readouterr().out
 
 
-def test_frames_without_a_subject_are_named_and_a_capture_of_such_alone_is_refused(unmasked, tmp_path, capsys):
+def test_frames_without_a_subject_are_named_and_a_capture_of_such_alone_is_refused(
+    unmasked, tmp_path, capsys
+):
     for name in "abcd":
         unmasked.put(f"images/{name}_001.png", unmasked.get(f"plates/{name}.png"))
     options = ["--method", "plate", "--no-clean", "--plate", str(unmasked.path / "plates")]

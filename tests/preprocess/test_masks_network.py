@@ -13,7 +13,9 @@ from viewmend.preprocess.masks.network import NetworkMasks  # noqa: E402
 
 def network(path, nodes, inputs, output):
     """Write a graph whose tensors are float32; `inputs` and `output` are names with shapes."""
-    tensors = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in inputs.items()]
+    tensors = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in inputs.items()
+    ]
     (name, shape), constants = output, [helper.make_tensor("half", TensorProto.FLOAT, [1], [0.5])]
     constants.append(helper.make_tensor("four", TensorProto.FLOAT, [1], [4.0]))
     told = helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)

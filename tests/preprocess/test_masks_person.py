@@ -28,7 +28,9 @@ def iou(mask, truth) -> float:
 
 def test_a_person_is_segmented_and_tracked(studio, monkeypatch):
     detected = []
-    monkeypatch.setattr(person, "_detect", lambda *given, detect=person._detect: detected.append(1) or detect(*given))
+    monkeypatch.setattr(
+        person, "_detect", lambda *given, detect=person._detect: detected.append(1) or detect(*given)
+    )
     maker = PersonMasks()
     for time in range(3):
         frame = studio.read(time)
@@ -42,7 +44,9 @@ def test_a_person_who_lies_or_stands_anywhere_is_found(studio):
     frame = studio.read(0)
     rgb, truth = view_rgb(frame, 1), frame.mask[1].numpy()
     for turns in (1, 3):
-        assert iou(PersonMasks().mask(np.ascontiguousarray(np.rot90(rgb, turns))), np.rot90(truth, turns)) > 0.85
+        assert (
+            iou(PersonMasks().mask(np.ascontiguousarray(np.rot90(rgb, turns))), np.rot90(truth, turns)) > 0.85
+        )
     wide = np.zeros((512, 1024, 3), np.uint8)
     wide[200:456, 700:956] = rgb
     expected = np.zeros((512, 1024), np.uint8)

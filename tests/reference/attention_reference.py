@@ -42,7 +42,9 @@ def transformer_reference(net, tokens, uvs, context_tokens, context_uvs, top_k):
         if number % config.blocks == 0:
             kept = list(range(len(context_tokens)))
         block = net.blocks[number]
-        KV = (context_tokens @ net.keys_values.weight.T + net.keys_values.bias).unflatten(1, (-1, 2, config.dim))
+        KV = (context_tokens @ net.keys_values.weight.T + net.keys_values.bias).unflatten(
+            1, (-1, 2, config.dim)
+        )
         K, V = KV[:, number, 0], KV[:, number, 1]
         Q = block.query(block.norm_query(P))
         outs, total = [], torch.zeros(len(context_tokens))
@@ -51,7 +53,9 @@ def transformer_reference(net, tokens, uvs, context_tokens, context_uvs, top_k):
             q, k, v = Q[:, own].clone(), K[kept][:, own].clone(), V[kept][:, own].clone()
             if config.rope:
                 q = torch.stack([rotate_reference(x, angle(u)) for x, u in zip(q, uvs, strict=True)])
-                k = torch.stack([rotate_reference(x, angle(context_uvs[i])) for x, i in zip(k, kept, strict=True)])
+                k = torch.stack(
+                    [rotate_reference(x, angle(context_uvs[i])) for x, i in zip(k, kept, strict=True)]
+                )
             out, received = attend_reference(q, k, v, scale)
             outs.append(out)
             total[kept] += received.detach()

@@ -15,7 +15,9 @@ from viewmend.types import MultiViewFrame
 RADIUS_M = 0.5
 
 
-def camera_at(angle_deg: float, name: str, size: int = 48, height_m: float = 0.0, distance_m: float = 2.0) -> Cameras:
+def camera_at(
+    angle_deg: float, name: str, size: int = 48, height_m: float = 0.0, distance_m: float = 2.0
+) -> Cameras:
     """A camera on a ring about the ball that looks at its centre; y is up."""
     angle = math.radians(angle_deg)
     eye = torch.tensor([distance_m * math.sin(angle), height_m, distance_m * math.cos(angle)])
@@ -53,7 +55,9 @@ def proxy(rows: int = 48) -> GeometryProxy:
     normals = torch.stack([lat.cos() * lon.sin(), lat.sin(), lat.cos() * lon.cos()], -1).reshape(-1, 3)
     i, j = torch.meshgrid(torch.arange(rows), torch.arange(2 * rows), indexing="ij")
     a, b = i * 2 * rows + j, i * 2 * rows + (j + 1) % (2 * rows)
-    faces = torch.cat([torch.stack([a, b, b + 2 * rows], -1), torch.stack([a, b + 2 * rows, a + 2 * rows], -1)])
+    faces = torch.cat(
+        [torch.stack([a, b, b + 2 * rows], -1), torch.stack([a, b + 2 * rows, a + 2 * rows], -1)]
+    )
     half = torch.full((3,), RADIUS_M)
     return GeometryProxy(Mesh(RADIUS_M * normals, faces.reshape(-1, 3)), normals, Bounds(-half, half))
 

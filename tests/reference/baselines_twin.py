@@ -29,7 +29,9 @@ def deformable_twin(x, offsets, masks, weight, bias):
                     down, right = offsets[2 * (g * points + k)], offsets[2 * (g * points + k) + 1]
                     y = row + k // kernel - kernel // 2 + float(down[row, col])
                     at = col + k % kernel - kernel // 2 + float(right[row, col])
-                    read = bilinear_twin(x[g * share : (g + 1) * share], y, at) * masks[g * points + k, row, col]
+                    read = (
+                        bilinear_twin(x[g * share : (g + 1) * share], y, at) * masks[g * points + k, row, col]
+                    )
                     own = weight[:, g * share : (g + 1) * share, k // kernel, k % kernel]
                     out[:, row, col] += own @ read
     return out

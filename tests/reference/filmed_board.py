@@ -16,7 +16,9 @@ def waved(count, size_m, seed=0, yaw_rad=np.pi, low=(-0.7, 0.25, -0.7), high=(0.
     rng = np.random.default_rng(seed)
     for number in range(count):
         yaw = yaw_rad * (2 * (number * 0.618 % 1) - 1) + rng.normal(0, 0.1)
-        turn = Rotation.from_euler("yxz", [yaw, *rng.uniform(-0.6, 0.6, 2)]).as_matrix() @ np.diag([1.0, -1, -1])
+        turn = Rotation.from_euler("yxz", [yaw, *rng.uniform(-0.6, 0.6, 2)]).as_matrix() @ np.diag(
+            [1.0, -1, -1]
+        )
         pose = np.eye(4)
         pose[:3, :3] = turn
         pose[:3, 3] = rng.uniform(low, high) - turn @ np.array([*np.array(size_m) / 2, 0])
@@ -71,5 +73,7 @@ def drawn(board, texels, grey):
     if key not in _DRAWN:
         rim = round(board.square_m * texels)
         size = (round(board.columns * board.square_m * texels), round(board.rows * board.square_m * texels))
-        _DRAWN[key] = cv2.copyMakeBorder(board.opencv.generateImage(size), *[rim] * 4, cv2.BORDER_CONSTANT, value=grey)
+        _DRAWN[key] = cv2.copyMakeBorder(
+            board.opencv.generateImage(size), *[rim] * 4, cv2.BORDER_CONSTANT, value=grey
+        )
     return _DRAWN[key]

@@ -44,7 +44,10 @@ def write_agisoft(file, cameras, old=False, moved=None):
         photos.append(f'<camera id="{index}" sensor_id="{index}" label="{label}" enabled="true">{photo}')
     photos.append(photos[-1].replace('enabled="true"', 'enabled="false"').replace('label="', 'label="off'))
     place = f"<rotation>{_numbers(turn)}</rotation><translation>{_numbers(shift)}</translation><scale>{scale}</scale>"
-    parts = [f"<sensors>{''.join(sensors)}</sensors>", f'<cameras><group id="0">{"".join(photos)}</group></cameras>']
+    parts = [
+        f"<sensors>{''.join(sensors)}</sensors>",
+        f'<cameras><group id="0">{"".join(photos)}</group></cameras>',
+    ]
     parts += [f"<transform>{place if moved is not None else ''}</transform>"]
     file.write_text(
         f'<?xml version="1.0"?>\n<document version="1.4.0"><chunk label="1">{"".join(parts)}</chunk></document>'

@@ -26,7 +26,10 @@ def write_take(folder, rig, frames, gaps, image, mask, foreground=255):
                 continue
             full = np.full(size, foreground, np.uint8)
             full[-2:, -2:] = 0
-            for path, pixels in ((image, np.full((*size, 3), 60 + 20 * (number % 9), np.uint8)), (mask, full)):
+            for path, pixels in (
+                (image, np.full((*size, 3), 60 + 20 * (number % 9), np.uint8)),
+                (mask, full),
+            ):
                 own = path.format(c=camera["name"], f=frame) if isinstance(path, str) else path(camera, frame)
                 file = folder / own
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +102,14 @@ def write_actorshq(folder, rig, frames, gaps=(), scale="4x", boxes=None):
     for camera in rig:
         w, h, K = camera["width"], camera["height"], camera["K"]
         turn = Rotation.from_matrix(camera["R"].T).as_rotvec()
-        numbers = [*turn, *world_from_camera(camera)[:3, 3], K[0, 0] / w, K[1, 1] / h, K[0, 2] / w, K[1, 2] / h]
+        numbers = [
+            *turn,
+            *world_from_camera(camera)[:3, 3],
+            K[0, 0] / w,
+            K[1, 1] / h,
+            K[0, 2] / w,
+            K[1, 2] / h,
+        ]
         rows.append([camera["name"], w, h, *(repr(float(n)) for n in numbers)])
     _write_table(folder / scale / "calibration.csv", rows)
     if boxes is not None:
@@ -117,7 +127,11 @@ def write_panoptic(folder, rig, frames, gaps=(), kind="hd"):
     cameras = []
     for camera in rig:
         entry = {"name": camera["name"], "type": kind, "resolution": [camera["width"], camera["height"]]}
-        entry |= {"panel": int(camera["name"][:2]), "node": int(camera["name"][3:]), "K": camera["K"].tolist()}
+        entry |= {
+            "panel": int(camera["name"][:2]),
+            "node": int(camera["name"][3:]),
+            "K": camera["K"].tolist(),
+        }
         entry |= {"distCoef": camera["dist"].tolist(), "R": camera["R"].tolist()}
         cameras.append(entry | {"t": (100 * camera["t"][:, None]).tolist()})
     cameras.append(cameras[0] | {"name": "50_01", "type": "kinect-color"})
@@ -135,7 +149,9 @@ def write_easyvolcap(folder, rig, frames, gaps=(), bounds=None, quoted=True):
         extra.append(f"t_{name}: 0.\nn_{name}: 1.\nf_{name}: 9.\n")
         if bounds is not None:
             data = ", ".join(repr(float(n)) for n in np.ravel(bounds))
-            extra.append(f"bounds_{name}: !!opencv-matrix\n   rows: 2\n   cols: 3\n   dt: d\n   data: [ {data} ]\n")
+            extra.append(
+                f"bounds_{name}: !!opencv-matrix\n   rows: 2\n   cols: 3\n   dt: d\n   data: [ {data} ]\n"
+            )
     with (folder / "extri.yml").open("a") as file:
         file.write("".join(extra))
     if not quoted:
@@ -151,7 +167,10 @@ def write_dna(folder, rig, frames, gaps=(), apart=False, colours=None, name="001
     places = [folder / "part1_main", folder / "part1_annotations"] if apart else [folder, folder]
     for place in places:
         place.mkdir(parents=True, exist_ok=True)
-    with h5py.File(places[0] / f"{name}.smc", "w") as main, h5py.File(places[1] / f"{name}_annots.smc", "w") as annots:
+    with (
+        h5py.File(places[0] / f"{name}.smc", "w") as main,
+        h5py.File(places[1] / f"{name}_annots.smc", "w") as annots,
+    ):
         main.attrs["actor_id"] = name[:4]
         for number, camera in enumerate(rig):
             cam = int(camera["name"])
@@ -191,7 +210,10 @@ def write_riftcast(folder, rig, frames, gaps=(), meta=None):
     cameras = []
     for camera in rig:
         view = np.vstack([np.c_[camera["R"], camera["t"]], [0, 0, 0, 1]])
-        lens = {"camera_matrix": camera["K"].ravel().tolist(), "resolution": [camera["width"], camera["height"]]}
+        lens = {
+            "camera_matrix": camera["K"].ravel().tolist(),
+            "resolution": [camera["width"], camera["height"]],
+        }
         entry = {"camera_id": int(camera["name"]), "camera_model_name": "a camera", "intrinsics": lens}
         cameras.append(entry | {"extrinsics": {"view_matrix": view.ravel().tolist()}})
     (folder / "calibration.json").write_text(json.dumps({"cameras": cameras}))

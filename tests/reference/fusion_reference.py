@@ -28,7 +28,9 @@ def left_by_views(point, voxel_m, views, config):
             distance = (surface - z) / voxel_m
             if surface > 0 and distance > -config.truncation_voxels:
                 distances.append(min(distance, config.truncation_voxels))
-                weights.append(max(float(views.confidence[view, row, column]), 1e-3) ** config.confidence_power)
+                weights.append(
+                    max(float(views.confidence[view, row, column]), 1e-3) ** config.confidence_power
+                )
 
     if not weights:
         return 1.0

@@ -12,7 +12,9 @@ VGG = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 def lpips_twin(image, truth, weights, backbone):
     """The published number for two images in [0, 1]."""
     total = 0.0
-    for layer, (a, b) in enumerate(zip(*(_features(x, weights, backbone) for x in (image, truth)), strict=True)):
+    for layer, (a, b) in enumerate(
+        zip(*(_features(x, weights, backbone) for x in (image, truth)), strict=True)
+    ):
         distance = 0.0
         for channel, head in enumerate(weights[f"heads.{layer}"].tolist()):
             distance += head * float((a[channel] - b[channel]).square().mean())

@@ -20,9 +20,21 @@ DEVICE = torch.device("meta")
 COPIES = (torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default)
 INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 """These take indices on the CPU for a tensor elsewhere."""
-WAITING = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::equal", "aten::is_nonzero")
+WAITING = (
+    "aten::_local_scalar_dense",
+    "aten::nonzero",
+    "aten::masked_select",
+    "aten::equal",
+    "aten::is_nonzero",
+)
 """The CPU waits for the device in these, because a result or its size is needed."""
-ALLOCATING = ("aten::empty", "aten::empty_strided", "aten::empty_like", "aten::new_empty", "aten::_unsafe_view")
+ALLOCATING = (
+    "aten::empty",
+    "aten::empty_strided",
+    "aten::empty_like",
+    "aten::new_empty",
+    "aten::_unsafe_view",
+)
 """These launch no kernel."""
 
 
@@ -63,14 +75,21 @@ class There(Tensor):
 
     @staticmethod
     def __new__(cls, values: Tensor) -> "There":
-        layout = {"strides": values.stride(), "storage_offset": values.storage_offset(), "dtype": values.dtype}
+        layout = {
+            "strides": values.stride(),
+            "storage_offset": values.storage_offset(),
+            "dtype": values.dtype,
+        }
         made = Tensor._make_wrapper_subclass(cls, values.size(), device=DEVICE, **layout)
         made.values = values
         return made
 
     def __getitem__(self, index):
         # Lists would become tensors without an operator.
-        parts = [torch.as_tensor(p) if isinstance(p, list) else p for p in (index if type(index) is tuple else [index])]
+        parts = [
+            torch.as_tensor(p) if isinstance(p, list) else p
+            for p in (index if type(index) is tuple else [index])
+        ]
         COUNTS.copies += sum(isinstance(part, list) for part in (index if type(index) is tuple else [index]))
         return super().__getitem__(tuple(parts))
 
@@ -95,11 +114,15 @@ class _Operators(TorchDispatchMode):
 def _compute(operator, args, kwargs):
     tensors = [value for value in tree_iter((args, kwargs)) if isinstance(value, Tensor)]
     there = [isinstance(tensor, There) for tensor in tensors]
-    assert sum(there) == sum(tensor.device == DEVICE for tensor in tensors), f"{operator}: a tensor without values"
+    assert sum(there) == sum(tensor.device == DEVICE for tensor in tensors), (
+        f"{operator}: a tensor without values"
+    )
     if operator not in COPIES:
         indexing = operator._schema.name in INDEXING
         compared = [args[0], *args[2:3]] if indexing else tensors
-        compared = [isinstance(tensor, There) for tensor in compared if isinstance(tensor, Tensor) and tensor.dim()]
+        compared = [
+            isinstance(tensor, There) for tensor in compared if isinstance(tensor, Tensor) and tensor.dim()
+        ]
         if len(set(compared)) > 1 or (indexing and any(there) and not there[0]):
             shapes = [(type(tensor).__name__, tuple(tensor.shape)) for tensor in tensors]
             raise RuntimeError(f"expected tensors on one device, got {shapes} for {operator}")
@@ -112,7 +135,9 @@ def _compute(operator, args, kwargs):
     found = operator(*given[0], **given[1])
     if not result_there:
         return found
-    found = tree_map_only(Tensor, lambda tensor: tensor if isinstance(tensor, There) else There(tensor), found)
+    found = tree_map_only(
+        Tensor, lambda tensor: tensor if isinstance(tensor, There) else There(tensor), found
+    )
     return return_and_correct_aliasing(operator, args, kwargs, found)
 
 

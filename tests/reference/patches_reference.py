@@ -30,5 +30,7 @@ def any_in_patch_reference(pixels, rows, cols):
     result = torch.zeros(len(pixels), rows, cols, dtype=torch.bool)
     for row in range(rows):
         for col in range(cols):
-            result[:, row, col] = pixels[:, row * 16 : row * 16 + 28, col * 16 : col * 16 + 28].flatten(1).any(1)
+            result[:, row, col] = (
+                pixels[:, row * 16 : row * 16 + 28, col * 16 : col * 16 + 28].flatten(1).any(1)
+            )
     return result

@@ -25,7 +25,10 @@ def random_rig(seed, count, distorted=5):
         dist[:distorted] = rng.uniform(-0.3, 0.3, distorted)
         camera = {"name": f"cam{number:02d}", "width": width, "height": height, "dist": dist}
         camera["K"] = np.array([[fx, 0, rng.uniform(1, 30)], [0, fy, rng.uniform(1, 30)], [0, 0, 1]])
-        camera |= {"R": Rotation.random(random_state=seed + int(number)).as_matrix(), "t": rng.uniform(-5, 5, 3)}
+        camera |= {
+            "R": Rotation.random(random_state=seed + int(number)).as_matrix(),
+            "t": rng.uniform(-5, 5, 3),
+        }
         rig.append(camera | {"image": f"images/{camera['name']}.png", "mask": f"masks/{camera['name']}.png"})
     return rig
 
@@ -50,7 +53,9 @@ def write_videos(folder, rig, frames=3, name="{}"):
 def write_images(folder, rig, frame=None):
     for camera in rig:
         for stream, value in (("images", 90), ("masks", 255)):
-            path = folder / (f"{stream}/{camera['name']}/{frame}.png" if frame else f"{stream}/{camera['name']}.png")
+            path = folder / (
+                f"{stream}/{camera['name']}/{frame}.png" if frame else f"{stream}/{camera['name']}.png"
+            )
             path.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(path), np.full((camera["height"], camera["width"], 3), value, np.uint8))
 

@@ -32,7 +32,9 @@ def random_view(seed: int, net: ViewSynthNet, longest: int = 200) -> tuple[Incom
     target = orbit([6.28 * angle], (between(64, longest), between(64, longest)), elevation_rad=height - 0.3)
     view = stream.render(target)
     if seed % 3 == 2:
-        view = replace(view, error=view.error * torch.rand(view.error.shape, generator=chance).sub(0.3).clamp_min(0))
+        view = replace(
+            view, error=view.error * torch.rand(view.error.shape, generator=chance).sub(0.3).clamp_min(0)
+        )
     return view, ContextProvider(lambda _, names: seen.context(names))
 
 

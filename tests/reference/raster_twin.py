@@ -22,7 +22,9 @@ def raster_twin(mesh, cameras, cull="none"):
             for x in range(columns):
                 ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1]
                 z = facing / (normals @ ray)
-                weights = np.linalg.solve(triangles.swapaxes(1, 2), (ray * z[:, None])[..., None])[..., 0].min(1)
+                weights = np.linalg.solve(triangles.swapaxes(1, 2), (ray * z[:, None])[..., None])[
+                    ..., 0
+                ].min(1)
                 possible = drawn & (z > 0)
                 margin[view, y, x] = np.abs(weights[possible]).min(initial=np.inf)
                 hits = np.flatnonzero(possible & (weights >= 0))

@@ -39,7 +39,8 @@ def hard():
     target, depth, normals, sources = scene(camera_at(25, "t", 24, 0.3), cameras)
     shape = sources.frame.rgb.shape
     rgb, mask = (
-        torch.randint(0, 256, size, generator=generator, dtype=torch.uint8) for size in (shape, (shape[0], *shape[2:]))
+        torch.randint(0, 256, size, generator=generator, dtype=torch.uint8)
+        for size in (shape, (shape[0], *shape[2:]))
     )
     frame = replace(sources.frame, rgb=rgb, mask=mask)
     noise = 1 + 0.02 * torch.randn(sources.depth.shape, generator=generator)
@@ -50,7 +51,11 @@ def hard():
 @pytest.mark.parametrize("fast", [blend_torch, blend])
 @pytest.mark.parametrize(
     ("config", "masked"),
-    [(BlendConfig(), True), (BlendConfig(), False), (BlendConfig(normal_power=1, view_power=4, slope_px=3.0), True)],
+    [
+        (BlendConfig(), True),
+        (BlendConfig(), False),
+        (BlendConfig(normal_power=1, view_power=4, slope_px=3.0), True),
+    ],
 )
 def test_both_implementations_equal_the_reference(hard, fast, config, masked):
     *given, sources = hard
@@ -85,7 +90,9 @@ def test_a_camera_at_the_target_gives_its_own_image_back():
 def test_an_occluder_takes_the_weight():
     target, depth, normals, sources = scene(camera_at(0, "t"), camera_at(20, "c"))
     seen, barely, hidden = (
-        blend(target, depth, normals, ContextViews(sources.frame, there), BIAS_M, BlendConfig()).weights[0].sum()
+        blend(target, depth, normals, ContextViews(sources.frame, there), BIAS_M, BlendConfig())
+        .weights[0]
+        .sum()
         for there in (sources.depth - nearer_m * (sources.depth > 0) for nearer_m in (0.0, 0.5 * BIAS_M, 0.3))
     )
     assert barely > 0.99 * seen > 1 and hidden == 0
@@ -111,6 +118,8 @@ def test_a_surface_that_faces_a_camera_counts_in_every_pixel(fast):
     normals = torch.zeros(*depth.shape, 3)
     normals[row, column] = torch.nn.functional.normalize(target.centers[0] - points, dim=-1)
     frame = replace(sources.frame, mask=torch.full_like(sources.frame.mask, 255))
-    weights = fast(target, depth, normals, ContextViews(frame, sources.depth), BIAS_M, BlendConfig()).weights[0]
+    weights = fast(target, depth, normals, ContextViews(frame, sources.depth), BIAS_M, BlendConfig()).weights[
+        0
+    ]
     inner = depth[row, column] < depth[depth > 0].quantile(0.5)
     assert len(row) > 500 and float(weights[row, column][inner].min()) > 0.99

@@ -21,7 +21,11 @@ def scene():
     stream = Stream(load_inpainter("rays"), bounds=studio.bounds)
     for time in range(2):
         observation = stream.add_frame(studio.read(time))
-    return stream, home_view(studio.cameras, observation.proxy.mesh.vertices.mean(0), studio.up), observation.proxy
+    return (
+        stream,
+        home_view(studio.cameras, observation.proxy.mesh.vertices.mean(0), studio.up),
+        observation.proxy,
+    )
 
 
 @pytest.mark.parametrize("context_times", [0, 1, None])
@@ -44,7 +48,9 @@ def test_a_crop_gives_the_same_image_as_the_whole_view(scene, azimuth, distance,
     assert int(((whole.view.mask != part.view.mask) | (whole.view.error != part.view.error)).sum()) <= 2
     off = (whole.rgb - part.rgb).abs().amax(0)
     assert float(off.mean()) < 1e-5
-    assert float((off > 1 / 255).float().mean()) < 3e-4  # holes so deep that a smooth fill is coarser than the grid
+    assert (
+        float((off > 1 / 255).float().mean()) < 3e-4
+    )  # holes so deep that a smooth fill is coarser than the grid
     assert part.view.camera is camera
     assert whole.view.weights.shape == part.view.weights.shape
 
@@ -55,7 +61,9 @@ def test_crops_lie_within_the_view(scene):
     found = mesh_crop(proxy.mesh.vertices, away)
     assert found.left < found.right <= 64 and found.top < found.bottom <= 48
     near = view_camera(Camera(distance=0.05), frame, (64, 48))
-    assert mesh_crop(proxy.mesh.vertices, near) == Crop.all_of(near), "a part of the subject is behind the camera"
+    assert mesh_crop(proxy.mesh.vertices, near) == Crop.all_of(near), (
+        "a part of the subject is behind the camera"
+    )
     assert mesh_crop(torch.zeros(0, 3), away) == Crop.all_of(away)
 
 

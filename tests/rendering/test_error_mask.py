@@ -36,10 +36,15 @@ def rendered(rule):
     return stream.render(camera_at(45, "t", 96))
 
 
-@pytest.mark.parametrize(("weight", "missing"), [(0.0, 1.0), (0.9e-5, 1.0), (1e-5, 0.0), (1.1e-5, 0.0), (1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("weight", "missing"), [(0.0, 1.0), (0.9e-5, 1.0), (1e-5, 0.0), (1.1e-5, 0.0), (1.0, 0.0)]
+)
 def test_pixels_below_the_weight_threshold_are_holes(weight, missing):
     blend = Blend(torch.zeros(3, 1, 1), torch.full((2, 1, 1), weight / 2), torch.zeros(1, 1))
-    assert error_rule("holes")(Evidence(mask=torch.ones(1, 1), depth=torch.ones(1, 1), blend=blend)).item() == missing
+    assert (
+        error_rule("holes")(Evidence(mask=torch.ones(1, 1), depth=torch.ones(1, 1), blend=blend)).item()
+        == missing
+    )
 
 
 def test_rule_all_marks_the_subject_and_its_rim_and_keeps_colours():
@@ -62,7 +67,10 @@ def test_an_impossible_fraction_is_refused(fraction):
     [
         ("thrice", "values from 0 to 3"),
         ("boolean", "torch.bool"),
-        ("rows", r'float32 of shape .*; begin with torch\.maximum\(error_rule\("holes"\)\(evidence\), \.\.\.\)'),
+        (
+            "rows",
+            r'float32 of shape .*; begin with torch\.maximum\(error_rule\("holes"\)\(evidence\), \.\.\.\)',
+        ),
         ("nothing", r"less on \d+ pixels of holes"),
         ("no_number", "values from nan"),
         ("none", "NoneType"),
@@ -81,7 +89,10 @@ def test_a_custom_rule_decides_the_mask(tmp_path):
     (tmp_path / "own.py").write_text(CUSTOM_RULES)
     soft, holes = rendered(f"{tmp_path / 'own.py'}:soft"), rendered("holes")
     subject = holes.mask > 0
-    assert torch.equal(soft.error[subject], holes.error[subject].clamp_min(0.5)) and 0 < float(holes.error.mean()) < 1
+    assert (
+        torch.equal(soft.error[subject], holes.error[subject].clamp_min(0.5))
+        and 0 < float(holes.error.mean()) < 1
+    )
 
 
 @pytest.mark.parametrize("name", ["double", "half"])

@@ -59,7 +59,9 @@ def test_points_equal_the_reference(distance_m):
 
 
 def test_the_size_of_near_dots_is_bounded():
-    vertices = torch.tensor([[0.0, 0, 1.99], [3, 0, -1], [0, 3, -1]])  # a centimetre before it, and two out of view
+    vertices = torch.tensor(
+        [[0.0, 0, 1.99], [3, 0, -1], [0, 3, -1]]
+    )  # a centimetre before it, and two out of view
     near = replace(BALL, mesh=Mesh(vertices, torch.tensor([[0, 1, 2]]).int()), normals=torch.eye(3))
     dot = hull_points(near, torch.ones(3, 3), camera_at(0, "t", size=96))[3]
     assert float(dot.sum()) == MAX_DOT_PX**2 and float(dot[48, 48]) == 1
@@ -69,5 +71,7 @@ def test_an_empty_proxy_gives_an_empty_image():
     none = replace(BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3).int()), normals=torch.zeros(0, 3))
     camera = camera_at(0, "t", size=32)
     away = camera_at(180, "t", size=32, distance_m=-2.0)
-    assert hull_points(none, torch.zeros(0, 3), camera).abs().max() == 0 == shaded_hull(none, camera).abs().max()
+    assert (
+        hull_points(none, torch.zeros(0, 3), camera).abs().max() == 0 == shaded_hull(none, camera).abs().max()
+    )
     assert hull_points(BALL, COLOURS, away).shape == (4, 32, 32)

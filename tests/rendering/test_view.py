@@ -50,14 +50,18 @@ def test_excluded_cameras_are_not_used():
     assert set(without.source_views) == set(alone.source_views)
     torch.testing.assert_close(without.rgb, alone.rgb)
     assert without.candidate_views == alone.candidate_views
-    assert without.silhouettes.cameras.names == alone.silhouettes.cameras.names == ("c0", "c2", "c3", "c4", "c5")
+    assert (
+        without.silhouettes.cameras.names == alone.silhouettes.cameras.names == ("c0", "c2", "c3", "c4", "c5")
+    )
     assert torch.equal(without.silhouettes.mask, alone.silhouettes.mask)
     with pytest.raises(ValueError, match="all of them excluded"):
         render_view(frame, BALL, target, config, exclude=frame.cameras.names)
 
 
 def test_an_empty_proxy_gives_an_empty_view():
-    empty = replace(BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32)), normals=torch.zeros(0, 3))
+    empty = replace(
+        BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32)), normals=torch.zeros(0, 3)
+    )
     view, _ = render_view(photograph(ring(4)), empty, camera_at(5, "t"), RenderConfig())
     assert view.mask.sum() == 0 and view.error.sum() == 0 and view.rgb.sum() == 0
     assert view.source_views[0] == "c0"
@@ -71,6 +75,8 @@ CENTER = torch.zeros(3)
 
 def test_angles_are_measured_at_the_subject():
     # Distance does not count: the second camera is much nearer.
-    cameras = concatenate_cameras([camera_at(30, "a"), camera_at(100, "b", distance_m=0.8), camera_at(10.001, "c")])
+    cameras = concatenate_cameras(
+        [camera_at(30, "a"), camera_at(100, "b", distance_m=0.8), camera_at(10.001, "c")]
+    )
     degrees = torch.rad2deg(angles_to(camera_at(10, "t"), cameras, CENTER))
     torch.testing.assert_close(degrees, torch.tensor([20.0, 90.0, 0.001]), atol=2e-4, rtol=0)

@@ -39,11 +39,18 @@ def test_crops_give_the_patches_and_tokens_of_whole_images():
 def test_it_trains_encoder_and_decoder_alone(tmp_path):
     samples = studio_samples("crops", SCENES_128).scene(0)
     list(write_shards(samples, tmp_path / "shards"))
-    config = TrainConfig(name="autoencoder", objective=OPTIONS, scenes=SCENES_128, shards=tmp_path / "shards", **RUN)
+    config = TrainConfig(
+        name="autoencoder", objective=OPTIONS, scenes=SCENES_128, shards=tmp_path / "shards", **RUN
+    )
     train(config, tmp_path / "run")
     torch.manual_seed(config.seed)
-    start, trained = OPTIONS.objective(config, OPTIONS, None).model.state_dict(), load_network(tmp_path / "run")
+    start, trained = (
+        OPTIONS.objective(config, OPTIONS, None).model.state_dict(),
+        load_network(tmp_path / "run"),
+    )
     changed = {
-        name.split(".")[0] for name, weight in trained.state_dict().items() if not torch.equal(weight, start[name])
+        name.split(".")[0]
+        for name, weight in trained.state_dict().items()
+        if not torch.equal(weight, start[name])
     }
     assert changed == {"tokeniser", "decoder"}

@@ -51,7 +51,9 @@ def test_what_the_camera_left_out_saw_changes_the_truth_alone(folders):
         assert torch.equal(one.inputs.cameras.K, two.inputs.cameras.K), "the rig is aligned without it"
         assert torch.equal(one.inputs.rgb, two.inputs.rgb) and torch.equal(one.inputs.mask, two.inputs.mask)
         assert torch.equal(one.truth.cameras.K, two.truth.cameras.K)
-        assert torch.equal(one.truth.rgb.roll(9, 3), two.truth.rgb) and not torch.equal(one.truth.rgb, two.truth.rgb)
+        assert torch.equal(one.truth.rgb.roll(9, 3), two.truth.rgb) and not torch.equal(
+            one.truth.rgb, two.truth.rgb
+        )
     assert not torch.equal(exact[0].truth.rgb, exact[1].truth.rgb), "each time is another"
 
 
@@ -71,7 +73,9 @@ def test_no_seed_is_in_two_splits():
     assert all(seeds[0] in PROCEDURAL_SEEDS["test"] for seeds in (P_SEEDS, Q_SEEDS))
 
 
-@pytest.mark.parametrize("place", ["people/test", "people/test/ann.glb", "captures/test/stage", "people/train/../test"])
+@pytest.mark.parametrize(
+    "place", ["people/test", "people/test/ann.glb", "captures/test/stage", "people/train/../test"]
+)
 def test_what_is_kept_for_tests_is_for_tests_alone(place):
     places = (Path("motions/train"), Path(place))
     assert recordings("test", places) == places
@@ -163,7 +167,9 @@ def test_data_that_changed_are_refused(captures, tmp_path):
         split_scenes(out)
     for path in paths:
         path.rename(path.with_name(path.name + "x"))
-    with pytest.raises(ValueError, match=r"expected the capture .*, got none; put the file where its paths hold"):
+    with pytest.raises(
+        ValueError, match=r"expected the capture .*, got none; put the file where its paths hold"
+    ):
         split_scenes(out)
 
 
@@ -191,7 +197,9 @@ def test_by_default_7_of_79_are_for_tests_and_scenes_are_a_random_subset(capture
     for count in (79, 158):
         many = make_splits([captures / f"{number:04d}" for number in range(count)], captures)
         assert sum(scene.split == "test" for scene in many.scenes) == 7 * count // 79
-    drawn = [{s.name for s in make_splits(paths, captures, seed=seed, scenes=10).scenes} for seed in (0, 0, 1)]
+    drawn = [
+        {s.name for s in make_splits(paths, captures, seed=seed, scenes=10).scenes} for seed in (0, 0, 1)
+    ]
     assert drawn[0] == drawn[1] != drawn[2] and len(drawn[0]) == len(drawn[2]) == 10
     assert drawn[0] != {path.name for path in paths[:10]}
     with pytest.raises(ValueError, match=r"at least the 101 captures of --scenes, got 100"):

@@ -20,7 +20,17 @@ Q_SHA256 = "843bf079a02642c3d8aaa83c35404709f0d6207d523a149b583f3aaeee045103"
 
 def sha256(scenes) -> str:
     facts = [
-        (s.name, s.rig, s.style, s.held, s.tempo, s.config.seed, s.config.cameras, s.config.frames, s.config.size_px)
+        (
+            s.name,
+            s.rig,
+            s.style,
+            s.held,
+            s.tempo,
+            s.config.seed,
+            s.config.cameras,
+            s.config.frames,
+            s.config.size_px,
+        )
         for s in scenes
     ]
     return hashlib.sha256(repr(facts).encode()).hexdigest()
@@ -78,12 +88,17 @@ def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_
 
 def test_cameras_without_colour_give_the_same_masks_and_visibility():
     config = StudioConfig(seed=1, cameras=7, rig="layers", frames=4, size_px=48, samples_per_side=2)
-    dense = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02", tempo="dance", scored_from=3)
+    dense = StudioScene(
+        name="s", set="A", rig="", style="", config=config, held="cam02", tempo="dance", scored_from=3
+    )
     sparse = replace(dense, coloured=5)
     assert dense.definition != sparse.definition
     for whole, part in zip(dense.frames(), sparse.frames(), strict=True):
         names = part.inputs.cameras.names
-        assert len(names) == (5 if part.inputs.time == 3 else 4) and sparse.held not in part.carving.cameras.names
+        assert (
+            len(names) == (5 if part.inputs.time == 3 else 4)
+            and sparse.held not in part.carving.cameras.names
+        )
         assert {*names, *part.carving.cameras.names} == set(whole.inputs.cameras.names)
         assert torch.equal(part.inputs.rgb, whole.inputs.select(names).rgb)
         assert torch.equal(part.carving.mask, whole.inputs.select(part.carving.cameras.names).mask)
@@ -99,7 +114,15 @@ def test_the_rigs_of_the_paper_leave_one_camera_out_and_draw_only_the_window():
         scenes = rig_set(name)
         assert len(scenes) == len({s.definition for s in scenes}) == 30
         assert len(scenes[0].studio().cameras) == count
-        assert len({s.held for s in scenes}) > 10 and scenes[0].times == RIG_TIMES == (0, 10, 20, 27, 28, 29, 30)
+        assert len({s.held for s in scenes}) > 10 and scenes[0].times == RIG_TIMES == (
+            0,
+            10,
+            20,
+            27,
+            28,
+            29,
+            30,
+        )
 
 
 def test_the_rigs_of_the_paper_use_the_people_whose_views_have_holes(shared, tmp_path):

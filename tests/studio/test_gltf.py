@@ -32,7 +32,9 @@ def test_reads_the_rest_pose(character_file):
     world = node_matrices(character, torch.eye(4))
     place = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
     for name, (_, position) in JOINTS.items():
-        torch.testing.assert_close(place[name], torch.tensor(position, dtype=torch.float32), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            place[name], torch.tensor(position, dtype=torch.float32), atol=1e-5, rtol=0
+        )
     bound = world[character.node_of_joint] @ character.joint_from_bind
     torch.testing.assert_close(bound, torch.eye(4).expand_as(bound), atol=1e-4, rtol=0)
 

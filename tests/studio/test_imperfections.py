@@ -8,7 +8,9 @@ from viewmend.studio.imperfections import Imperfections, imperfect_cameras, impe
 from viewmend.studio.rigs import ring_rig
 from viewmend.types import MultiViewFrame
 
-SWITCHES = "exposure_stops white_balance shot_noise read_noise spill jpeg_quality mask_edge_px mask_holes mask_blobs"
+SWITCHES = (
+    "exposure_stops white_balance shot_noise read_noise spill jpeg_quality mask_edge_px mask_holes mask_blobs"
+)
 STRENGTHS = (0.3, 0.1, 0.05, 0.02, 0.5, 40, 2.0, 3.0, 3.0)
 
 
@@ -55,7 +57,10 @@ def test_every_hole_begins_in_the_subject(frame):
     """A hole next to it would change nothing: a small subject loses as many as a large one."""
     small = replace(frame, mask=torch.zeros_like(frame.mask))
     small.mask[:, 18:22, 23:27] = 255
-    hit = [imperfect_frame(small, Imperfections(mask_holes=8.0), seed).mask[0].sum() < 16 * 255 for seed in range(20)]
+    hit = [
+        imperfect_frame(small, Imperfections(mask_holes=8.0), seed).mask[0].sum() < 16 * 255
+        for seed in range(20)
+    ]
     assert all(hit)
 
 

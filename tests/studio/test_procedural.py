@@ -23,13 +23,22 @@ def walker():
 
 
 def tensors(scene: TexturedMesh):
-    return (scene.mesh.vertices, scene.mesh.faces, scene.normals, scene.uv, scene.texture_of_face, *scene.textures)
+    return (
+        scene.mesh.vertices,
+        scene.mesh.faces,
+        scene.normals,
+        scene.uv,
+        scene.texture_of_face,
+        *scene.textures,
+    )
 
 
 def test_the_same_seed_is_the_same_bit_for_bit(walker):
     again = procedural_scene(SEED, style=WALKER)
     assert again.description == walker.description
-    assert all(torch.equal(a, b) for a, b in zip(tensors(again.pose(1.3)), tensors(walker.pose(1.3)), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(tensors(again.pose(1.3)), tensors(walker.pose(1.3)), strict=True)
+    )
 
 
 @pytest.mark.parametrize("seed", [SEED, SEED + 1, SEED + 2])
@@ -97,7 +106,9 @@ def test_gestures_take_turns_without_a_jump(walker, kind):
     motion = moving(walker, "dance", kind).motion
     times = np.arange(0, 2 * motion.bar_s, 1 / 50)
     arms = [arm for time in times for arm in motion.stance(float(time)).arms]
-    angles = np.array([(a.flexion, a.abduction, a.twist, a.elbow, a.curl) for a in arms]).reshape(len(times), 10)
+    angles = np.array([(a.flexion, a.abduction, a.twist, a.elbow, a.curl) for a in arms]).reshape(
+        len(times), 10
+    )
     assert np.abs(np.diff(angles, axis=0)).max() < 0.35
 
 
@@ -124,7 +135,9 @@ def test_each_cloth_paints_colours_that_vary(kind):
     assert image.shape == (100, 120, 3) and image.min() >= 0 and image.max() <= 1 and image.std() > 0.004
 
 
-@pytest.mark.parametrize("style, message", [({"motion": "moonwalk"}, "moonwalk"), ({"people": 7}, "1 or 2 people")])
+@pytest.mark.parametrize(
+    "style, message", [({"motion": "moonwalk"}, "moonwalk"), ({"people": 7}, "1 or 2 people")]
+)
 def test_unknown_styles_are_refused(style, message):
     with pytest.raises(ValueError, match=message):
         procedural_scene(SEED, style=PerformerStyle(**style))

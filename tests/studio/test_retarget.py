@@ -41,7 +41,10 @@ def test_limbs_point_as_the_actors_do(character_file, motion_file):
         bone = motion.rotations[3, motion.names.index(joint)] @ offsets[child]
         a = torch.nn.functional.normalize(at[end] - at[start], dim=0)
         torch.testing.assert_close(a, bone / bone.norm(), atol=1e-4, rtol=0)
-    for part, joint in (("Hips", "Hips"), ("Spine", "lowerback")):  # they turn as a whole, from their rest pose
+    for part, joint in (
+        ("Hips", "Hips"),
+        ("Spine", "lowerback"),
+    ):  # they turn as a whole, from their rest pose
         node = [n.name for n in character.nodes].index(part)
         turn = torch.nn.functional.normalize(world[node, :3, :3], dim=0)
         torch.testing.assert_close(turn, motion.rotations[3, motion.names.index(joint)], atol=1e-4, rtol=0)
@@ -91,7 +94,9 @@ def test_units_are_powers_of_ten_and_nobody_is_resized(character_file, motion_fi
 
 
 def test_between_frames_is_between(character_file, tmp_path):
-    motion = write_motion(tmp_path / "slow.bvh", {"Hips": (10, 20, 40), "LeftShoulder": (80, 10, -30)}, frames=30)
+    motion = write_motion(
+        tmp_path / "slow.bvh", {"Hips": (10, 20, 40), "LeftShoulder": (80, 10, -30)}, frames=30
+    )
     body = retarget(load_character(character_file), read_bvh(motion))
     before, middle, after = (body.joint_matrices(f) for f in (7.0, 7.5, 8.0))
     assert float((after - before).abs().max()) > 0.02
@@ -120,7 +125,14 @@ def test_right_sides_mirror_left_ones():
 
 def test_other_names_are_read():
     sided = ("UpperLeg", "LowerLeg", "Foot", "Toes", "Shoulder", "UpperArm", "LowerArm", "Hand", "Thumb1")
-    names = ["J_Bip_C_Hips", "J_Bip_C_Spine", "J_Bip_C_Chest", "J_Bip_C_UpperChest", "J_Bip_C_Neck", "J_Bip_C_Head"]
+    names = [
+        "J_Bip_C_Hips",
+        "J_Bip_C_Spine",
+        "J_Bip_C_Chest",
+        "J_Bip_C_UpperChest",
+        "J_Bip_C_Neck",
+        "J_Bip_C_Head",
+    ]
     names += [f"J_Bip_{side}_{part}" for side in "LR" for part in sided]
     found = find_parts(names)
     assert set(REQUIRED) <= set(found)

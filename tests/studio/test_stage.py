@@ -24,7 +24,9 @@ def folders(tmp_path):
     (tmp_path / "moves").mkdir()
     for name in ("a", "b"):
         write_character(tmp_path / "people" / f"{name}.glb")
-        write_motion(tmp_path / "moves" / f"{name}.bvh", {"LeftShoulder": (70, 0, 0), "Hips": (0, 0, 40)}, frames=30)
+        write_motion(
+            tmp_path / "moves" / f"{name}.bvh", {"LeftShoulder": (70, 0, 0), "Hips": (0, 0, 40)}, frames=30
+        )
     return {"performers": tmp_path / "people", "motions": tmp_path / "moves"}
 
 

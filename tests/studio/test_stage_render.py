@@ -50,14 +50,19 @@ def test_the_left_hand_is_at_the_images_right(character_file, tmp_path):
     rgb = render(lit(performer.pose(0.0)), orbit([0.0], (96, 96), elevation_rad=0.0)).rgb[0].int()
     columns = torch.arange(96).float()
     red, green = ((rgb[a] - rgb[b]).clamp(min=0).float() for a, b in ((0, 1), (1, 0)))
-    assert float((red.sum(0) * columns).sum() / red.sum()) > float((green.sum(0) * columns).sum() / green.sum()) + 10
+    assert (
+        float((red.sum(0) * columns).sum() / red.sum())
+        > float((green.sum(0) * columns).sum() / green.sum()) + 10
+    )
     top = int((rgb.sum(0) > 0).any(1).nonzero()[0])
     assert int(green[top].sum()) > 0 and top < 30
 
 
 def test_shading_is_that_of_the_reference():
     scene = sphere(0.6)
-    near = look_at(torch.tensor([0.8, 1.2, 0.4]), torch.tensor([0.0, 0.95, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+    near = look_at(
+        torch.tensor([0.8, 1.2, 0.4]), torch.tensor([0.0, 0.95, 0.0]), torch.tensor([0.0, 1.0, 0.0])
+    )
     cameras = concatenate_cameras([ring_rig(2, (60, 44), seed=2), pinhole(1.0, 50, 48, near, "near")])
     surface = lit(scene)
     background = torch.rand(3, 3, 48, 60, generator=torch.Generator().manual_seed(1))

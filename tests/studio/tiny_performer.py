@@ -12,7 +12,10 @@ import numpy as np
 def both_sides(*parts: tuple[str, str, float, float, float]) -> dict:
     """Joints of the left and the right side, from name, parent and place of the left ones."""
     return {
-        f"{side}{part}": (parent if parent in ("Hips", "Spine", "lowerback") else side + parent, (sign * x, y, z))
+        f"{side}{part}": (
+            parent if parent in ("Hips", "Spine", "lowerback") else side + parent,
+            (sign * x, y, z),
+        )
         for side, sign in (("Left", 1), ("Right", -1))
         for part, parent, x, y, z in parts
     }
@@ -56,7 +59,9 @@ def write_character(path: Path, prefix: str = "") -> Path:
     n = len(names)
     vertices = (places[:, None] + 0.06 * corners[None]).reshape(-1, 3).astype(np.float32)
     normals = np.tile(corners / np.sqrt(3, dtype=np.float32), (n, 1)).astype(np.float32)
-    uv = np.repeat([[0.25, 0.5] if name.startswith("Left") else [0.75, 0.5] for name in names], 8, 0).astype(np.float32)
+    uv = np.repeat([[0.25, 0.5] if name.startswith("Left") else [0.75, 0.5] for name in names], 8, 0).astype(
+        np.float32
+    )
     joints = np.zeros((8 * n, 4), np.uint8)
     joints[:, 0] = np.repeat(np.arange(n), 8)
     weights = np.tile(np.array([1, 0, 0, 0], np.float32), (8 * n, 1))
@@ -72,7 +77,9 @@ def write_character(path: Path, prefix: str = "") -> Path:
     kinds = [("VEC3", 5126), ("VEC3", 5126), ("VEC2", 5126), ("VEC4", 5121), ("VEC4", 5126), ("SCALAR", 5123)]
     blobs = [a.tobytes() for a in arrays] + [png]
     starts = itertools.accumulate(map(len, blobs), initial=0)
-    views = [{"buffer": 0, "byteOffset": n, "byteLength": len(b)} for n, b in zip(starts, blobs, strict=False)]
+    views = [
+        {"buffer": 0, "byteOffset": n, "byteLength": len(b)} for n, b in zip(starts, blobs, strict=False)
+    ]
     data = b"".join(blobs)
     data += b"\0" * (-len(data) % 4)
     accessors = [
@@ -123,7 +130,10 @@ BVH_JOINTS = {
 
 
 def write_motion(
-    path: Path, angles: dict[str, tuple[float, float, float]] | None = None, frames: int = 4, travel_cm: float = 20.0
+    path: Path,
+    angles: dict[str, tuple[float, float, float]] | None = None,
+    frames: int = 4,
+    travel_cm: float = 20.0,
 ) -> Path:
     """A cgspeed-like BVH; `angles` (z, x, y in degrees) grow linearly from the first frame to the last."""
     angles = angles or {}

@@ -20,7 +20,9 @@ SAMPLING = SamplingConfig(frames=(0, 1), with_context=True, num_ray_views=3, min
 MODEL = replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2)
 VIEWS_SCENES = replace(SCENES, cameras=(5, 6))
 VIEWS_SAMPLING = SamplingConfig(num_ray_views=4)
-VIEWS_MODEL = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8, error_features=8)
+VIEWS_MODEL = ViewsConfig(
+    num_views=4, width=8, sample_channels=4, features=8, fine_features=8, error_features=8
+)
 VIEWS_RENDER = RenderConfig(error_rule="all")
 RUN: dict[str, Any] = {
     **{"steps": 4, "batch": 2, "new_per_batch": 1, "replay_size": 3, "warmup": 1, "workers": 0, "ema": 0.5},
@@ -46,7 +48,9 @@ def shards(tmp_path_factory) -> Path:
     """Clips of two frames, made once for all runs."""
     folder = tmp_path_factory.mktemp("shards")
     source = studio_samples("tests", clip_length=2)
-    list(write_shards((sample for number in range(3) for sample in source.scene(number)), folder, shard_size=2))
+    list(
+        write_shards((sample for number in range(3) for sample in source.scene(number)), folder, shard_size=2)
+    )
     return folder
 
 

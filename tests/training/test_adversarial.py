@@ -33,7 +33,9 @@ def random_images(kind, rng, low=0.0, high=1.0, sizes=SIZES):
 
 
 def judged(truth, completed, *error):
-    return Judged(truth, completed, [torch.full(p.shape[1:], float(t)) for p, t in zip(completed, error, strict=True)])
+    return Judged(
+        truth, completed, [torch.full(p.shape[1:], float(t)) for p, t in zip(completed, error, strict=True)]
+    )
 
 
 def entropy(logits, target):
@@ -42,7 +44,10 @@ def entropy(logits, target):
 
 FORMULAS = {
     "gan": (lambda real, fake: entropy(real, 1.0) + entropy(fake, 0.0), lambda fake: -entropy(fake, 0.0)),
-    "hinge": (lambda real, fake: (1 - real).relu().mean() + (1 + fake).relu().mean(), lambda fake: -fake.mean()),
+    "hinge": (
+        lambda real, fake: (1 - real).relu().mean() + (1 + fake).relu().mean(),
+        lambda fake: -fake.mean(),
+    ),
 }
 """Of the discriminator and of the inpainter, from the logits of one image."""
 
@@ -128,7 +133,9 @@ def test_a_view_without_a_hole_contributes_zero(loss, rng):
     assert completed[1].grad is not None and completed[1].grad.any()
     alone = inpainter_objective(net.eval(), judged(truth[1:], completed[1:], 1), loss)
     both = inpainter_objective(net, judged(truth, completed, 0, 1), loss)
-    assert float(both.detach()) == pytest.approx(float(alone.detach()) / 2), "it counts as 0 in the mean, as in L_in"
+    assert float(both.detach()) == pytest.approx(float(alone.detach()) / 2), (
+        "it counts as 0 in the mean, as in L_in"
+    )
     none = discriminator_objective(net, judged(truth, completed, 0, 0), loss)
     none.backward()
     assert float(none.detach()) == 0

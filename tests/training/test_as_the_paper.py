@@ -74,9 +74,13 @@ def test_padding_is_not_white():
     views = context(5)
     cameras, size_px = views.frame.cameras, views.frame.cameras.size_px.clone()
     size_px[0, 0] -= 10
-    frame = replace(views.frame, cameras=replace(cameras, size_px=size_px), mask=torch.zeros_like(views.frame.mask))
+    frame = replace(
+        views.frame, cameras=replace(cameras, size_px=size_px), mask=torch.zeros_like(views.frame.mask)
+    )
     shown = build_context_input(replace(views, frame=frame), paper()).channels
-    assert not shown[0, :3, :, -10:].any() and (shown[0, :3, :, :-10] == 1).all() and (shown[1, :3] == 1).all()
+    assert (
+        not shown[0, :3, :, -10:].any() and (shown[0, :3, :, :-10] == 1).all() and (shown[1, :3] == 1).all()
+    )
 
 
 def test_the_shipped_model_is_the_papers_and_beats_telea_on_the_subject():
@@ -85,7 +89,9 @@ def test_the_shipped_model_is_the_papers_and_beats_telea_on_the_subject():
     flawless = SceneConfig(sizes_px=(224,), cameras=(8, 8), num_holdout_views=3, imperfect_fraction=0.0)
     scenes = replace(flawless, hull_resolution=64)
     sampling, telea = replace(SAMPLING, min_hole_px=200), Telea()
-    samples = SampleScenes(StudioRigs(scenes, sampling.frames, "shipped", "validation"), scenes, sampling).scene(0)
+    samples = SampleScenes(
+        StudioRigs(scenes, sampling.frames, "shipped", "validation"), scenes, sampling
+    ).scene(0)
     squares = {"model": [], "telea": []}
     for sample in samples:
         truth, compared = true_image(sample, "white"), (sample.view.error > 0) & (sample.alpha > 127)

@@ -84,7 +84,9 @@ def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):
     lines = compare(place, AUTO, bad, good, tmp_path / "sheet.png").splitlines()
     assert len(lines) == 7 and (tmp_path / "sheet.png").stat().st_size > 1000
     for line in lines[2:]:
-        _, psnr_before, psnr_after, lpips_before, lpips_after = (part.strip() for part in line.strip("|").split("|"))
+        _, psnr_before, psnr_after, lpips_before, lpips_after = (
+            part.strip() for part in line.strip("|").split("|")
+        )
         assert float(psnr_after) > float(psnr_before) and float(lpips_after) < float(lpips_before)
 
 
@@ -111,7 +113,9 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     kept = []
     out = train(config, tmp_path / "run", report=lambda _: kept.append(first_weight(tmp_path / "run")))
     assert max(entry["step"] for entry in log_of(out)) == 4, "three validations after the best one"
-    assert all(float(value) == float(kept[0]) for value in kept), "step 1 was the best: step 2 gained too little"
+    assert all(float(value) == float(kept[0]) for value in kept), (
+        "step 1 was the best: step 2 gained too little"
+    )
     assert "1 steps of" in (out / "README.md").read_text()
     train(config, out)
     assert float(first_weight(out)) == float(kept[0]), "a finished run stays as it is"

@@ -40,7 +40,11 @@ def test_recipes_are_consistent(name):
 def test_the_recipes_of_the_paper_are_the_papers(name, model):
     config = make_recipe(name)
     objective, sampling = config.objective, config.objective.sampling
-    assert isinstance(objective, PaperObjectiveConfig) and objective.model == model() and objective.adversarial == 0.01
+    assert (
+        isinstance(objective, PaperObjectiveConfig)
+        and objective.model == model()
+        and objective.adversarial == 0.01
+    )
     last = max(sampling.frames)
     assert set(sampling.frames) == set(window_times(last, paper())) and sampling.min_history == 6
     assert sampling.num_source_views == (3,) and sampling.num_target_frames == 1
@@ -150,7 +154,9 @@ def test_stored_rays_train_the_ray_fill(tiny, tmp_path):
     list(write_shards(batches, shards))
     again = ShardScenes(shards, "0", RayBatch).scene(0)
     assert {sample_to_bytes(x) for x in again} == {sample_to_bytes(x) for x in batches}
-    config = TrainConfig(name="rays", objective=RAYS, scenes=SCENES, shards=shards, **(RUN | {"validate_every": 4}))
+    config = TrainConfig(
+        name="rays", objective=RAYS, scenes=SCENES, shards=shards, **(RUN | {"validate_every": 4})
+    )
     trained = load_network(train(config, tmp_path / "rays"))
     assert isinstance(trained, RayFill)
     assert '"holes"' in (tmp_path / "rays/log.jsonl").read_text()

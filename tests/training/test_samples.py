@@ -60,7 +60,10 @@ def capture_samples(capture, **changes):
 
 
 def test_the_last_frame_with_enough_history_is_a_target(studio):
-    rig, scenes = LeaveOneOut({time: studio.read(time) for time in (0, 1)}), replace(SCENES, num_holdout_views=1)
+    rig, scenes = (
+        LeaveOneOut({time: studio.read(time) for time in (0, 1)}),
+        replace(SCENES, num_holdout_views=1),
+    )
     samples = rig_samples(rig, scenes, replace(SAMPLING, min_history=1, min_hole_px=0), Random(0))
     assert samples and {sample.view.time for sample in samples} == {1}
     with pytest.raises(ValueError, match="with 2 frames before"):
@@ -74,7 +77,9 @@ def test_a_sample_does_not_depend_on_the_image_of_the_held_out_camera(studio):
     changed.rgb[2] = 255
     changed.mask[2] = 255
     first, second = (
-        HeldOutCamera(LeaveOneOut({1: f}), held, HullConfig(resolution=48)).sample(1, (1,), RenderConfig(), SAMPLING)
+        HeldOutCamera(LeaveOneOut({1: f}), held, HullConfig(resolution=48)).sample(
+            1, (1,), RenderConfig(), SAMPLING
+        )
         for f in (frame, changed)
     )
     assert first is not None and second is not None
@@ -136,7 +141,8 @@ def test_a_clip_is_one_camera_at_consecutive_frames():
 def test_no_studio_uses_a_seed_reserved_for_validation_or_tests():
     random = Random(1)
     seeds, validation = (
-        {random_studio(SCENES, 1, random, split).seed for _ in range(60)} for split in ("training", "validation")
+        {random_studio(SCENES, 1, random, split).seed for _ in range(60)}
+        for split in ("training", "validation")
     )
     assert seeds < {*range(9000)} and len(seeds) > 50
     assert validation < {*range(9000, 10000)}
@@ -199,7 +205,9 @@ def test_a_mix_has_the_requested_fractions():
         mix.rig(number)
     assert 0.68 < len(real.requested) / 800 < 0.82
     assert real.requested[: len(real.requested) // 2] == real.requested[len(real.requested) // 2 :]
-    assert {*real.requested, *studio.requested} == {*range(400)} and not {*real.requested} & {*studio.requested}
+    assert {*real.requested, *studio.requested} == {*range(400)} and not {*real.requested} & {
+        *studio.requested
+    }
 
 
 def test_samples_are_stored_losslessly_and_damage_is_detected(tmp_path):
@@ -274,7 +282,9 @@ def splits(takes, tmp_path) -> Path:
 
 
 def test_of_a_splits_file_only_the_training_captures_are_used(splits):
-    training = {scene.name: scene.left_out for scene in read_splits(splits).scenes if scene.split == "training"}
+    training = {
+        scene.name: scene.left_out for scene in read_splits(splits).scenes if scene.split == "training"
+    }
     config = replace(SCENES, sizes_px=(64,), captures=(splits,), captures_fraction=1.0)
     rigs = rig_source(config, (0, 1), "0")
     assert [capture.name for capture, _ in rigs.first.captures] == list(training)

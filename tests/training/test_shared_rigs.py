@@ -17,10 +17,20 @@ from viewmend.training.shared_rigs import SharedRigScenes, WrongMasks, _SharedRi
 from viewmend.types import MultiViewFrame, Silhouettes
 
 SCENES = SceneConfig(
-    sizes_px=(64,), cameras=(12, 12), rigs=("layers",), shared_hull=True, num_holdout_views=2, imperfect_fraction=1.0
+    sizes_px=(64,),
+    cameras=(12, 12),
+    rigs=("layers",),
+    shared_hull=True,
+    num_holdout_views=2,
+    imperfect_fraction=1.0,
 )
 SAMPLING = SamplingConfig(
-    frames=(0, 2), min_history=1, with_context=True, num_source_views=(3,), source_view_weights=(1,), min_hole_px=3
+    frames=(0, 2),
+    min_history=1,
+    with_context=True,
+    num_source_views=(3,),
+    source_view_weights=(1,),
+    min_hole_px=3,
 )
 
 
@@ -45,7 +55,9 @@ def test_samples_are_those_of_a_stream_of_all_images(protocol):
     samples = rig.samples(SAMPLING.frames)
     assert samples
     for sample in samples:
-        stream = Stream(Unfilled(), StreamConfig(hull=HullConfig(resolution=scenes.hull_resolution), memory_mb=None))
+        stream = Stream(
+            Unfilled(), StreamConfig(hull=HullConfig(resolution=scenes.hull_resolution), memory_mb=None)
+        )
         for time in SAMPLING.frames:
             frame: MultiViewFrame = studio.read(time)
             held = frame.select(rig.held)

@@ -103,7 +103,9 @@ def test_a_run_that_is_stopped_loses_no_step(tiny, tmp_path):
     train(tiny, tmp_path / "parts", report=reported.append, stopped=lambda: bool(reported))
     assert [entry.step for entry in reported] == [1]
     train(tiny, tmp_path / "parts", report=reported.append)
-    assert [entry.step for entry in reported] == [1, 2, 3, 4] and same_weights(tmp_path / "whole", tmp_path / "parts")
+    assert [entry.step for entry in reported] == [1, 2, 3, 4] and same_weights(
+        tmp_path / "whole", tmp_path / "parts"
+    )
 
 
 def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path):
@@ -140,13 +142,17 @@ def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, t
     (tmp_path / "parts" / FILE).unlink()
     reported = []
     train(tiny, tmp_path / "parts", report=reported.append)
-    assert [entry.step for entry in reported] == [3, 4] and same_weights(tmp_path / "whole", tmp_path / "parts")
+    assert [entry.step for entry in reported] == [3, 4] and same_weights(
+        tmp_path / "whole", tmp_path / "parts"
+    )
 
 
 def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, monkeypatch):
     train(replace(tiny, steps=2), tmp_path)
     before = {name: (tmp_path / name).read_bytes() for name in (FILE, "model.safetensors")}
-    monkeypatch.setattr(torch.optim.AdamW, "step", lambda self: self.param_groups[0]["params"][0].data.fill_(torch.inf))
+    monkeypatch.setattr(
+        torch.optim.AdamW, "step", lambda self: self.param_groups[0]["params"][0].data.fill_(torch.inf)
+    )
     with pytest.raises(FloatingPointError, match="expected finite"):
         train(replace(tiny, steps=3), tmp_path)
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
@@ -155,7 +161,9 @@ def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, mon
 def test_averages_forget_the_beginning_and_then_follow_slowly(tiny, tmp_path):
     with join_processes() as own:
         run = Run(replace(tiny, ema=0.9, learning_rate=0.01), tmp_path, None, own)
-        seen = [[weight.detach().clone() for weight in run.model.parameters()] for _ in islice(run.steps(), 2)]
+        seen = [
+            [weight.detach().clone() for weight in run.model.parameters()] for _ in islice(run.steps(), 2)
+        ]
         for average, first, second in zip(run.averaged.parameters(), *seen, strict=True):
             assert torch.allclose(average, 2 / 11 * first + 9 / 11 * second, atol=1e-6), "faster at first"
     late = torch.tensor([0.0])
@@ -173,7 +181,9 @@ def test_gradients_are_clipped(tiny, tmp_path, monkeypatch):
             run = Run(tiny, tmp_path / str(norm), None, own)
             before = [weight.detach().clone() for weight in run.trained]
             list(islice(run.steps(), 1))
-            moved[norm] = max(float((a.detach() - b).abs().max()) for a, b in zip(run.trained, before, strict=True))
+            moved[norm] = max(
+                float((a.detach() - b).abs().max()) for a, b in zip(run.trained, before, strict=True)
+            )
     assert moved[1e-12] < 0.01 * moved[1.0]
 
 
@@ -259,11 +269,17 @@ def test_validation_scores_the_averaged_weights_and_writes_an_image(tiny, tmp_pa
     for sample in islice(samples, tiny.validation_views):
         with torch.no_grad():
             completed = model([sample.view], [list(sample.context)])[0].composited.clamp(0, 1)
-        filled, _ = telea.step_on("white", sample.view, ContextProvider(lambda *_: None), telea.initial_state())
+        filled, _ = telea.step_on(
+            "white", sample.view, ContextProvider(lambda *_: None), telea.initial_state()
+        )
         truth, holes = true_image(sample, "white"), sample.view.error > 0
         off = [(rgb - truth)[:, holes] for rgb in (completed, composite("white", filled.rgb, filled.opacity))]
         found.append([-10 * float(each.square().mean().log10()) for each in off])
     expected = torch.tensor(found).mean(0).tolist()
-    assert [logged[-1]["validation"][name] for name in ("holes", "telea")] == pytest.approx(expected, abs=2e-3)
+    assert [logged[-1]["validation"][name] for name in ("holes", "telea")] == pytest.approx(
+        expected, abs=2e-3
+    )
     assert logged[0]["validation"]["telea"] == logged[1]["validation"]["telea"], "the views are fixed"
-    assert sorted(p.name for p in tmp_path.glob("*.png")) == [f"validation-{step:06d}.png" for step in (0, 3, 4)]
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == [
+        f"validation-{step:06d}.png" for step in (0, 3, 4)
+    ]

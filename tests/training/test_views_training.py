@@ -253,7 +253,9 @@ def test_holes_are_guessed_by_the_ray_fill_of_another_model(stored, tmp_path):
     net, rays = initial_model(options, "float32"), load_network("rays")
     assert torch.equal(net.coarse.choose.weight, rays.choose.weight)
     assert not any(weight.requires_grad for weight in net.coarse.parameters())
-    assert all(weight.requires_grad for name, weight in net.named_parameters() if not name.startswith("coarse."))
+    assert all(
+        weight.requires_grad for name, weight in net.named_parameters() if not name.startswith("coarse.")
+    )
     sample = stored.sample(0, VIEWS_RENDER, 4)
     view = TrainingView.of(sample, net)
     holes = view.view.holes
@@ -324,7 +326,9 @@ def test_every_parameter_gets_a_gradient(view):
     objective = make_objective(OPTIONS)
     output = objective([view, view])
     output.total.backward()
-    still = [n for n, p in objective.model.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0]
+    still = [
+        n for n, p in objective.model.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0
+    ]
     assert still == []
     assert float(output.image.outside) > 0 and float(output.image.log_error) < 0
 

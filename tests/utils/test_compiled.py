@@ -8,7 +8,9 @@ def double(value):
 
 
 def test_read_only_installation_caches_in_a_private_folder_or_not_at_all(monkeypatch, tmp_path):
-    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")  # as if nothing is writable
+    monkeypatch.setattr(
+        numba.config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator"
+    )  # as if nothing is writable
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setattr(compiled.tempfile, "gettempdir", lambda: str(tmp_path))
     function = compiled.kernel(double)

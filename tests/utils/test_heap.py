@@ -81,7 +81,9 @@ def test_loaded_objects_are_excluded_from_collection():
 
 def test_compiled_convolutions_are_bounded(monkeypatch):
     monkeypatch.setenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "7")
-    assert heap.configure_allocator() and heap.os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == "7", "the user's choice"
+    assert heap.configure_allocator() and heap.os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == "7", (
+        "the user's choice"
+    )
     monkeypatch.delenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY")
     assert heap.configure_allocator()
     assert heap.os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == str(heap.KERNELS)

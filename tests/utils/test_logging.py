@@ -48,7 +48,9 @@ def test_what_is_logged_is_a_line_a_message(terminal, monkeypatch):
     logging.getLogger("viewmend.live").error("while rendering %s", ODD, exc_info=failed())
     lines = terminal().splitlines()
     assert lines[:2] == [f"while rendering {ESCAPED}", "Traceback (most recent call last):"]
-    assert lines[-1] == f"RuntimeError: {ESCAPED}" and "cam" not in "".join(lines[1:-1]).replace(repr(ODD), "")
+    assert lines[-1] == f"RuntimeError: {ESCAPED}" and "cam" not in "".join(lines[1:-1]).replace(
+        repr(ODD), ""
+    )
 
 
 def test_logs_that_somebody_hears_are_left_to_them(monkeypatch):
@@ -63,7 +65,9 @@ def test_a_traceback_keeps_an_errors_words_in_its_line():
     lines = escaped_traceback(failed()).split("\n")
     assert lines.count("Traceback (most recent call last):") == 2 and lines[-1] == f"RuntimeError: {ESCAPED}"
     assert "During handling of the above exception, another exception occurred:" in lines
-    assert not any(line.startswith("viewmend: wrote") for line in lines) and all(line.isprintable() for line in lines)
+    assert not any(line.startswith("viewmend: wrote") for line in lines) and all(
+        line.isprintable() for line in lines
+    )
 
 
 def test_a_command_logs_and_fails_in_escaped_lines(terminal, monkeypatch):

@@ -38,7 +38,9 @@ def without_choice() -> dict[str, str]:
 def processor_seconds(first: str, second: str) -> float:
     """Processor time of convolutions on two threads in a process that imports these modules before and after torch."""
     script = CONVOLUTIONS.format(first=first, second=second)
-    done = subprocess.run([sys.executable, "-c", script], env=without_choice(), capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=without_choice(), capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return float(done.stdout)
 
@@ -60,7 +62,9 @@ def busy_cores():
 def test_threads_do_not_spin_next_to_other_programs(busy_cores, order):
     spinning = processor_seconds("", "")
     sleeping = processor_seconds(*order)
-    assert sleeping < 0.8 * spinning, f"{sleeping:.2f} s of processor time, {spinning:.2f} s with spinning threads"
+    assert sleeping < 0.8 * spinning, (
+        f"{sleeping:.2f} s of processor time, {spinning:.2f} s with spinning threads"
+    )
 
 
 @pytest.mark.parametrize("name", CHOICES)
@@ -75,7 +79,9 @@ def test_what_the_user_chose_stays(monkeypatch, name):
 
 def test_processes_that_are_started_inherit_the_policy():
     script = f"import os, viewmend; print(os.environ['{POLICY}'])"
-    done = subprocess.run([sys.executable, "-c", script], env=without_choice(), capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=without_choice(), capture_output=True, text=True
+    )
     assert done.stdout == "PASSIVE\n", done.stderr
 
 

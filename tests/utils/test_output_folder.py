@@ -28,7 +28,9 @@ def published(out, pictures=("0", "1")):
 
 
 def seen(out):
-    return sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and ".viewmend" not in p.parts)
+    return sorted(
+        p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and ".viewmend" not in p.parts
+    )
 
 
 def test_what_a_run_made_the_next_one_replaces(tmp_path):
@@ -55,7 +57,9 @@ def test_a_signal_waits_until_what_is_unfinished_is_gone(tmp_path, monkeypatch):
         assert ended.value.code == 143 and not list(tmp_path.rglob("draft")) and not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize("name", ["pictures/000123.png", "pictures/0.png", "pictures/deep/a.txt", "sheet.png"])
+@pytest.mark.parametrize(
+    "name", ["pictures/000123.png", "pictures/0.png", "pictures/deep/a.txt", "sheet.png"]
+)
 @pytest.mark.parametrize("before", [True, False], ids=["after a run", "before any"])
 def test_what_somebody_put_there_stays(name, before, tmp_path):
     if before:
@@ -64,7 +68,9 @@ def test_what_somebody_put_there_stays(name, before, tmp_path):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("precious")
     there = seen(tmp_path)
-    with pytest.raises(ValueError, match=f"{name}: expected no such file, or an unchanged one from an earlier run"):
+    with pytest.raises(
+        ValueError, match=f"{name}: expected no such file, or an unchanged one from an earlier run"
+    ):
         published(tmp_path)
     assert path.read_text() == "precious" and seen(tmp_path) == there
 
@@ -84,7 +90,9 @@ def test_two_runs_never_write_to_one_folder(tmp_path):
         "OutputFolder(Path(sys.argv[1])).__enter__()\n"
     )
     with OutputFolder(tmp_path):
-        other = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, check=False)
+        other = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path)], capture_output=True, check=False
+        )
         assert other.returncode == 1 and b"got one in use" in other.stderr
     assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False).returncode == 0
 
@@ -145,7 +153,9 @@ def test_a_damaged_manifest_knows_nothing(text, tmp_path):
         published(tmp_path)
 
 
-@pytest.mark.parametrize("name", [".viewmend", ".viewmend/draft", ".viewmend/lock", ".viewmend/files.json", ".half-x"])
+@pytest.mark.parametrize(
+    "name", [".viewmend", ".viewmend/draft", ".viewmend/lock", ".viewmend/files.json", ".half-x"]
+)
 def test_links_lead_no_run_to_what_is_elsewhere(name, tmp_path):
     theirs, out = tmp_path / "theirs", tmp_path / "out"
     (theirs / "draft").mkdir(parents=True)

@@ -17,7 +17,9 @@ ARRAYS = st.builds(
     st.sampled_from(SHAPES),
 )
 LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(), ARRAYS)
-VALUES = st.recursive(LEAVES, lambda v: st.lists(v) | st.tuples(v, v) | st.dictionaries(st.text(), v), max_leaves=8)
+VALUES = st.recursive(
+    LEAVES, lambda v: st.lists(v) | st.tuples(v, v) | st.dictionaries(st.text(), v), max_leaves=8
+)
 
 
 def to_lists(value):
@@ -78,7 +80,9 @@ def test_nothing_is_called(read, tmp_path, monkeypatch):
     for protocol in range(6):
         for value in (Malicious(), [Malicious()], {"a": Malicious()}):
             data = pickle.dumps(value, protocol)
-            with pytest.raises(ValueError, match=r"got (_?io|builtins|__builtin__)\.open; is it the right file"):
+            with pytest.raises(
+                ValueError, match=r"got (_?io|builtins|__builtin__)\.open; is it the right file"
+            ):
                 read(data)
     assert not (tmp_path / "made").exists()
     pickle.loads(data)["a"].close()  # unpickling would have opened the file
@@ -109,7 +113,9 @@ def test_nested_lists_do_not_become_text(read, function):
         read(pickle.dumps(Named()))
 
 
-@pytest.mark.parametrize("value", [np.array(["a"]), np.array([1j]), np.array([(1, 2.0)], [("a", int), ("b", float)])])
+@pytest.mark.parametrize(
+    "value", [np.array(["a"]), np.array([1j]), np.array([(1, 2.0)], [("a", int), ("b", float)])]
+)
 def test_other_arrays_are_rejected(read, value):
     with pytest.raises(ValueError, match="expected numbers, strings, lists, dicts and arrays"):
         read(pickle.dumps(value))

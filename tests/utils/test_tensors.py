@@ -33,7 +33,9 @@ def test_what_is_small_is_no_copy():
     assert to_mmap("name") == "name" and to_mmap(None) is None
 
 
-@pytest.mark.parametrize("of", [torch.uint8, torch.bool, torch.int32, torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize(
+    "of", [torch.uint8, torch.bool, torch.int32, torch.float16, torch.bfloat16, torch.float64]
+)
 def test_types_and_strides(of):
     wide = torch.randint(0, 2, (2, 300, 500)).to(of)
     part = wide[:, 7:300:2, 3:].transpose(1, 2)
@@ -59,7 +61,9 @@ def test_its_pages_go_with_it():
 
 
 def test_extremes_of_images_of_any_shape_and_precision():
-    part = torch.tensor([[0.5, -2.0]], requires_grad=True)  # its numbers must not be read one by one, with a warning
+    part = torch.tensor(
+        [[0.5, -2.0]], requires_grad=True
+    )  # its numbers must not be read one by one, with a warning
     images = [part, torch.ones(3, 2, dtype=torch.float64), torch.tensor([3.0, torch.nan]).half()]
     found = extremes(images)
     assert found[:2] == [(-2.0, 0.5), (1.0, 1.0)] and torch.tensor(found[2]).isnan().all()

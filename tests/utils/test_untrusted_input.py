@@ -71,11 +71,15 @@ class Car(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def test_what_fits_is_typed():
     car = typed(read_json('{"wheels": [{"radius": 2, "teeth": 4.0}], "colour": null, "price": null}'), Car)
     assert car == Car(wheels=(Wheel("", 2.0, 4),))
-    assert typed({"wheels": [{"teeth": "7", "radius": "2.5"}]}, Car, strict=False).wheels[0] == Wheel("", 2.5, 7)
+    assert typed({"wheels": [{"teeth": "7", "radius": "2.5"}]}, Car, strict=False).wheels[0] == Wheel(
+        "", 2.5, 7
+    )
 
 
 def test_nulls_in_objects_are_absent_and_whole_numbers_are_integers_at_any_depth():
-    found: Any = read_json('[null, {"a": null, "b": [{"c": null, "d": 2.0, "e": -1e3}, null], "f": 1e308, "g": 0.5}]')
+    found: Any = read_json(
+        '[null, {"a": null, "b": [{"c": null, "d": 2.0, "e": -1e3}, null], "f": 1e308, "g": 0.5}]'
+    )
     assert found == [None, {"b": [{"d": 2, "e": -1000}, None], "f": 1e308, "g": 0.5}]
     assert [type(value) for value in found[1]["b"][0].values()] == [int, int]
     assert type(found[1]["f"]) is float
@@ -89,8 +93,14 @@ def test_nulls_in_objects_are_absent_and_whole_numbers_are_integers_at_any_depth
         ('{"wheels": []}', "wheels: expected a list that is not empty, got []; look"),
         ("[1]", "expected an object of keys, got [1]; look"),
         ('{"wheels": [{"radius": NaN}]}', "wheels[0]: radius: expected a finite number, got NaN; look"),
-        ('{"wheels": [{"radius": 1e999}]}', "wheels[0]: radius: expected a finite number, got Infinity; look"),
-        ('{"wheels": [{}, {"name": "w", "teeth": 2}]}', "wheel 'w': teeth: expected a whole number >= 3, got 2; look"),
+        (
+            '{"wheels": [{"radius": 1e999}]}',
+            "wheels[0]: radius: expected a finite number, got Infinity; look",
+        ),
+        (
+            '{"wheels": [{}, {"name": "w", "teeth": 2}]}',
+            "wheel 'w': teeth: expected a whole number >= 3, got 2; look",
+        ),
         ('{"wheels": [{"teeth": true}]}', "wheels[0]: teeth: expected a whole number, got true; look"),
         ('{"wheels": [{}], "colour": "red\\n"}', 'colour: expected red or green, got "red\\n"; look'),
         ('{"wheels": [{}], "price": "1"}', 'price: expected a number, got "1"; look'),
@@ -123,9 +133,13 @@ def test_numbers_of_any_size_fit_or_are_refused():
 
 
 @pytest.mark.parametrize(
-    "text", ["[" + "[]," * MOST_PARTS + "0]", b"[" + b'{"a":[]},' * (MOST_PARTS // 2) + b"0]"], ids=["text", "bytes"]
+    "text",
+    ["[" + "[]," * MOST_PARTS + "0]", b"[" + b'{"a":[]},' * (MOST_PARTS // 2) + b"0]"],
+    ids=["text", "bytes"],
 )
 def test_more_lists_and_objects_than_anything_has_are_refused_unread(text):
-    with pytest.raises(ValueError, match=f"at most {MOST_PARTS} lists and objects, got {MOST_PARTS + 1}; is it"):
+    with pytest.raises(
+        ValueError, match=f"at most {MOST_PARTS} lists and objects, got {MOST_PARTS + 1}; is it"
+    ):
         read_json(text)
     assert len(read_json("[" + "[]," * 1000 + "0]")) == 1001

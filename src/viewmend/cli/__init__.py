@@ -39,14 +39,24 @@ COMMANDS = (
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
     Command("make-dataset", "viewmend.cli.make_dataset", "Generate training samples in advance."),
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on standard scenes and on captures."),
-    Command("evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."),
+    Command(
+        "evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."
+    ),
     Command("weights", "viewmend.cli.weights", "List third-party weights."),
-    Command("weights get", "viewmend.cli.weights_get", "Download the networks of LPIPS (VGG16) and VFID (I3D)."),
+    Command(
+        "weights get", "viewmend.cli.weights_get", "Download the networks of LPIPS (VGG16) and VFID (I3D)."
+    ),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture."),
-    Command("calibrate", "viewmend.cli.calibrate", "Calibrate cameras with a board, or refine them with silhouettes."),
+    Command(
+        "calibrate",
+        "viewmend.cli.calibrate",
+        "Calibrate cameras with a board, or refine them with silhouettes.",
+    ),
     Command("splits", "viewmend.cli.splits", "Write a train/test split of captures."),
     Command("convert", "viewmend.cli.convert", "Convert a capture of any supported format."),
-    Command("export-scene", "viewmend.cli.export_scene", "Export a capture for game engines: mesh, points, depth."),
+    Command(
+        "export-scene", "viewmend.cli.export_scene", "Export a capture for game engines: mesh, points, depth."
+    ),
     Command("export", "viewmend.cli.export", "Export a model for C++ and other runtimes."),
     Command("check", "viewmend.cli.check", "Check a capture, and describe it."),
 )

@@ -58,7 +58,12 @@ def run(options: Options) -> int:
     if options.json:
         print_json(figures)
     else:
-        show(*(f"{name}  " + ", ".join(f"{key} {n:.4g}" for key, n in row.items()) for name, row in figures.items()))
+        show(
+            *(
+                f"{name}  " + ", ".join(f"{key} {n:.4g}" for key, n in row.items())
+                for name, row in figures.items()
+            )
+        )
     say(f"wrote {options.out}")
     return 0
 
@@ -83,7 +88,9 @@ def _by_board(options: Options, out: Path) -> Figures:
     with busy("adjusting all cameras"):
         found = calibrate(seen, board, [camera.name for camera in footage.cameras], sizes)
     cameras = tuple(
-        replace(camera, K=one.K, dist=one.dist, R=one.camera_from_world[:3, :3], t_m=one.camera_from_world[:3, 3])
+        replace(
+            camera, K=one.K, dist=one.dist, R=one.camera_from_world[:3, :3], t_m=one.camera_from_world[:3, 3]
+        )
         for camera, one in zip(footage.cameras, found, strict=True)
     )
     up = -sum(camera.R[1] for camera in cameras)
@@ -108,13 +115,17 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
     names = frames[0].cameras.names
     with busy("choosing how far cameras may move"):
         hold = best_hold(frames, bounds)
-    scores = [refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")]
+    scores = [
+        refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")
+    ]
     for score in scores:
         say(
             f"{score.camera} left out: IoU of its mask and the others' hull {score.before:.4f}, "
             f"after refining them {score.after:.4f}"
         )
-    before, after = (sum(own) / len(scores) for own in zip(*((s.before, s.after) for s in scores), strict=True))
+    before, after = (
+        sum(own) / len(scores) for own in zip(*((s.before, s.after) for s in scores), strict=True)
+    )
     if after <= before:
         raise ValueError(
             "expected left-out cameras to agree better with the refined others, got a mean IoU of "

@@ -90,7 +90,9 @@ def _frame(capture: "CaptureFolder", options: Options) -> "MultiViewFrame":
         return first_with_subject(capture) or capture.read(0)
     if not 0 <= options.frame < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
-        raise ValueError(f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again")
+        raise ValueError(
+            f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again"
+        )
     frame = capture.read(options.frame)
     if capture.has_masks and not frame.has_subject:
         expected = f"foreground in the masks of frame '{capture.frame_ids[options.frame]}'"
@@ -170,18 +172,20 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         f"  depth     {'yes' if capture['depth'] else 'none'}",
         f"  gaps      {f'{len(gaps)}: ' if gaps else 'none'}{', '.join(gaps[:3])}{', ...' if len(gaps) > 3 else ''}",
         f"  unit      {capture['metres_per_unit']:g} m; all lengths below are in metres",
-        *(
-            [f"  origin    {_vector(capture['origin_m'])} m in the capture's files; its coordinates below are relative"]
-            if any(capture["origin_m"])
-            else []
-        ),
+    ]
+    if any(capture["origin_m"]):
+        origin = _vector(capture["origin_m"])
+        lines.append(f"  origin    {origin} m in the capture's files; its coordinates below are relative")
+    lines += [
         f"  up        {'unknown' if capture['up'] is None else _vector(capture['up'], 3)}",
         f"  bounds    {'none' if bounds is None else f'{_vector(bounds[0])} to {_vector(bounds[1])}'}",
         f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",
     ]
     few = len(capture["cameras"]) < FEW_CAMERAS or capture["camera_spacing_deg"] > WIDE_DEG
     expected = "; expect foggy bodies and doubled limbs; 8 or more cameras, 45 degrees apart, avoid them"
-    lines.append(f"  angles    {capture['camera_spacing_deg']:.0f} degrees between neighbours{expected if few else ''}")
+    lines.append(
+        f"  angles    {capture['camera_spacing_deg']:.0f} degrees between neighbours{expected if few else ''}"
+    )
     if iou is not None:
         subject = capture["subject_extent_m"]
         extent = "none: the masks have no point in common" if subject is None else _extent(subject)
@@ -199,7 +203,11 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
     if capture["findings"]:
         lines += ["", "  issues:", *(f"  - {text}" for text in capture["findings"])]
     if capture["adjustments"]:
-        lines += ["", "  mend, serve and evaluate change:", *(f"  - {text}" for text in capture["adjustments"])]
+        lines += [
+            "",
+            "  mend, serve and evaluate change:",
+            *(f"  - {text}" for text in capture["adjustments"]),
+        ]
     return lines
 
 

@@ -71,7 +71,9 @@ def check_least(options: object, **least: int) -> None:
     for name, low in least.items():
         value = getattr(options, name)
         if value is not None and not value >= low:
-            raise ValueError(f"expected --{name.replace('_', '-')} of at least {low}, got {value}; see --help")
+            raise ValueError(
+                f"expected --{name.replace('_', '-')} of at least {low}, got {value}; see --help"
+            )
 
 
 def check_device(name: str) -> None:

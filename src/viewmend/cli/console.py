@@ -36,7 +36,9 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
             if not total:
                 return f"{description}: {done}"
             left_s = (time.monotonic() - start) * (total / done - 1) if done else None
-            return f"{description}: {done} of {total}{'' if left_s is None else f', {_duration(left_s)} left'}"
+            return (
+                f"{description}: {done} of {total}{'' if left_s is None else f', {_duration(left_s)} left'}"
+            )
 
         with Heartbeat(text):
             for done, item in enumerate(items):  # noqa: B007 (read by `text`)

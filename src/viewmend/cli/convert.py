@@ -40,6 +40,8 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --scale above 0 and at most 1, got {options.scale}; choose again")
     capture = open_capture(options.source, options.cameras or None, options.format)
     subset = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)), options.scale)
-    write_capture(subset, options.out, images=options.images, progress=partial(track, description=options.out.name))
+    write_capture(
+        subset, options.out, images=options.images, progress=partial(track, description=options.out.name)
+    )
     say(f"{options.out}: {len(subset.cameras)} cameras, {len(subset.frame_ids)} frames")
     return 0

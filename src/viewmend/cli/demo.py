@@ -69,7 +69,9 @@ def run(options: Options) -> int:
     say(f"scene: {studio.performer.description}")
     path = _path(options)
     error_model = error_model_for(inpainter) if render.error_rule == "predicted" else None
-    mender = Mender(inpainter, StreamConfig(render=render, memory_mb=None), studio.bounds, error_model=error_model)
+    mender = Mender(
+        inpainter, StreamConfig(render=render, memory_mb=None), studio.bounds, error_model=error_model
+    )
     summary = MendSummary()
     steps = []
     with OutputFolder(options.out) as folder:
@@ -115,4 +117,6 @@ def _write(out: Path, steps: "Sequence[MendStep]") -> None:
     for n in sorted(range(len(steps)), key=lambda n: -int(steps[n].completed.view.holes.sum())):
         if len(chosen) < SHEET_ROWS and all(abs(n - other) >= MIN_GAP for other in chosen):
             chosen.append(n)
-    write_image(out / "contact_sheet.png", contact_sheet([sheet_row(steps[n]) for n in sorted(chosen)], 260, 340))
+    write_image(
+        out / "contact_sheet.png", contact_sheet([sheet_row(steps[n]) for n in sorted(chosen)], 260, 340)
+    )

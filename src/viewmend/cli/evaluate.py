@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import Geometry, Precision, PreparationOptions, ViewOptions, check_device, check_least
+from viewmend.cli.checks import (
+    Geometry,
+    Precision,
+    PreparationOptions,
+    ViewOptions,
+    check_device,
+    check_least,
+)
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -152,7 +159,9 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     if not sets:
         raise ValueError("expected at least one set, got no set; P needs no data")
     if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+        raise ValueError(
+            f"{options.out}: expected a folder for the results, got a file; choose another --out"
+        )
     check_device(options.device)
     from viewmend.cli.console import say, track
     from viewmend.evaluation.report import make_report
@@ -177,7 +186,9 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     store = CellStore(options.out / "cells")
     cells = []
     steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
-    for cell in track((cell for found in steps for cell in found), "evaluating", len(scenes) * len(available)):
+    for cell in track(
+        (cell for found in steps for cell in found), "evaluating", len(scenes) * len(available)
+    ):
         cells.append(cell)
         if cell.error is not None:
             say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
@@ -247,7 +258,9 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
     inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
     if not inputs:
         raise ValueError("expected --inputs all or a number of cameras, got none; leave it out for all")
-    captured = [s for number in inputs for s in capture_set(Path(name), number, options.frames, options.format)[part]]
+    captured = [
+        s for number in inputs for s in capture_set(Path(name), number, options.frames, options.format)[part]
+    ]
     return [replace(scene, **prepared) for scene in captured]
 
 

@@ -88,13 +88,17 @@ def _make(options: Options) -> None:
     began = time.monotonic()
     shards = []
     samples = islice(_missing(at, samples_in_order(source, at.scene, options.workers)), count)
-    for shard in write_shards(track(samples, "samples", count), options.out, options.objective.shard_size, at.shards):
+    for shard in write_shards(
+        track(samples, "samples", count), options.out, options.objective.shard_size, at.shards
+    ):
         shards.append(shard)
         at.shards += 1
         write_text(options.out / POSITION, json.dumps(asdict(at)))
     rate = count / (time.monotonic() - began)
     size_mb = sum(path.stat().st_size for path in shards) / 1e6
-    say(f"wrote {count} samples in {len(shards)} shards, {size_mb:.0f} MB, to {options.out}: {rate:.1f} samples/s")
+    say(
+        f"wrote {count} samples in {len(shards)} shards, {size_mb:.0f} MB, to {options.out}: {rate:.1f} samples/s"
+    )
 
 
 @dataclass(kw_only=True)

@@ -61,10 +61,14 @@ def run(options: Options) -> int:
     capture = open_capture(options.source, options.cameras or None, options.format, alpha=alpha)
     part = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)))
     source = part if alpha else _masked(options, capture, part)
-    empty = write_capture(source, options.out, images=options.images, progress=lambda times: track(times, "masks"))
+    empty = write_capture(
+        source, options.out, images=options.images, progress=lambda times: track(times, "masks")
+    )
     if len(empty) == len(part.frame_ids):
         got = f"none in {len(empty)} frame{'s' if len(empty) > 1 else ''}"
-        raise CaptureError(f"{options.out}: expected a subject, got {got}; remove the folder and try another --method")
+        raise CaptureError(
+            f"{options.out}: expected a subject, got {got}; remove the folder and try another --method"
+        )
     if empty:
         say(f"{without_subject(part, empty, len(part.frame_ids))}; their masks are empty")
     say(f"{options.out}: masks of {len(part.cameras)} cameras, {len(part.frame_ids)} frames; check them with")
@@ -82,11 +86,15 @@ def _check(options: Options) -> None:
             f"expected one of --plate and --plate-frames, got {'both' if plates else 'none'}; give one of them"
         )
     if plates and options.method not in ("plate", "onnx"):
-        raise ValueError(f"expected plates only with --method plate or onnx, got --method {options.method}; drop them")
+        raise ValueError(
+            f"expected plates only with --method plate or onnx, got --method {options.method}; drop them"
+        )
     if (options.method == "onnx") != (options.network is not None):
         raise ValueError("expected --network with --method onnx and with no other; give both or neither")
     if options.out.exists() and not (options.out.is_dir() and not any(options.out.iterdir())):
-        raise CaptureError(f"{options.out}: expected a new or empty folder, got one with files; choose another")
+        raise CaptureError(
+            f"{options.out}: expected a new or empty folder, got one with files; choose another"
+        )
 
 
 def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture":
@@ -104,7 +112,9 @@ def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture"
     elif options.plate_frames is not None:
         plates = plates_from_frames(capture, chosen_times(options.plate_frames, len(capture.frame_ids)))
     if options.method == "person":
-        return MaskedCapture(part, {name: PersonMasks() for name in names}, "none" if options.no_clean else "parts")
+        return MaskedCapture(
+            part, {name: PersonMasks() for name in names}, "none" if options.no_clean else "parts"
+        )
     if options.method == "onnx":
         assert options.network is not None
         makers = {name: NetworkMasks(options.network, plates.get(name)) for name in names}

@@ -112,7 +112,9 @@ def run(options: Options) -> int:
     quality = RenderQuality(top_k=options.top_k)
     by_prediction = options.protocol == "predicted-mask"
     mask_model = load_named(MASK_MODEL, options.device, options.precision) if by_prediction else None
-    mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol, mask_model)
+    mender = Mender(
+        inpainter, config, capture.bounds, held, quality, error_model, options.protocol, mask_model
+    )
     summary = MendSummary(options.protocol)
     mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
@@ -131,7 +133,9 @@ def run(options: Options) -> int:
             output.add(step)
     say(f"wrote {options.out}")
     if summary.empty:
-        say(f"{without_subject(capture, summary.empty, len({time for time, _ in plan}))}; they show the background")
+        say(
+            f"{without_subject(capture, summary.empty, len({time for time, _ in plan}))}; they show the background"
+        )
     if options.json:
         print_json(summary.as_json())
     else:
@@ -142,11 +146,17 @@ def run(options: Options) -> int:
 def _check(options: Options) -> None:
     """Raise a ValueError for options that contradict each other or are out of range."""
     if (options.leave_out is None) == (options.path is None):
-        raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
+        raise ValueError(
+            "expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them"
+        )
     if options.leave_out is None and options.protocol not in ("strict", "predicted-mask"):
-        raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out")
+        raise ValueError(
+            f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out"
+        )
     if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+        raise ValueError(
+            f"{options.out}: expected a folder for the results, got a file; choose another --out"
+        )
     check_least(options, top_k=1)
 
 
@@ -175,7 +185,9 @@ def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> li
     usable = [time for time in times if capture.present[inputs, time].sum() >= 2]
     left_out = [capture.frame_ids[time] for time in times if time not in usable]
     if not usable:
-        raise ValueError(f"{capture.name}: expected a frame with two input cameras, got none; choose other --frames")
+        raise ValueError(
+            f"{capture.name}: expected a frame with two input cameras, got none; choose other --frames"
+        )
     if left_out:
         count = f"{len(left_out)} of {len(times)} frames"
         say(f"{count} have fewer than two input cameras and are left out; the first is '{left_out[0]}'")
@@ -193,10 +205,14 @@ def _plan(
         return [(time, capture.cameras.select([options.leave_out])) for time in times]
     if turntable is not None:
         return _circle(turntable, capture, usable)
-    return pair_with_frames(read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture)), times)
+    return pair_with_frames(
+        read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture)), times
+    )
 
 
-def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int]) -> "list[tuple[int, Cameras]]":
+def _circle(
+    turntable: "Turntable", capture: "CaptureSource", usable: list[int]
+) -> "list[tuple[int, Cameras]]":
     """Frame indices and the camera of each view of a turntable, whose images show the whole motion."""
     import math
 

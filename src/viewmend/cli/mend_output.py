@@ -65,7 +65,11 @@ class MendOutput:
         """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
         completed = step.completed
         number = f"{self._count:06d}.png"
-        shown = {"completed": step.completed_rgb, "holes": completed.view.error[None], "rendered": step.rendered}
+        shown = {
+            "completed": step.completed_rgb,
+            "holes": completed.view.error[None],
+            "rendered": step.rendered,
+        }
         for name, image in (shown if step.truth is None else shown | {"true": step.truth}).items():
             write_image(self._draft / name / number, picture(image))
         if self._alpha:
@@ -114,7 +118,9 @@ def depth_image_m(completed: CompletedView) -> Float32[np.ndarray, "height width
     return completed.surface_depth.clamp(max=MAX_DEPTH_M).float().cpu().numpy()
 
 
-def side_by_side(images: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "_height _width 3"]:
+def side_by_side(
+    images: dict[str, UInt8[np.ndarray, "height width 3"]],
+) -> UInt8[np.ndarray, "_height _width 3"]:
     """Whole views in their own size with their names above."""
     width = max(image.shape[1] for image in images.values())
     return contact_sheet([[Tile(name, image) for name, image in images.items()]], width)
@@ -135,11 +141,15 @@ def sheet_row(step: MendStep) -> list[Tile]:
     magenta = torch.tensor(HOLE_COLOUR, device=step.rendered.device)[:, None, None]
     holes = torch.where(view.holes, magenta, step.rendered)
     images = {f"rendered, frame {view.time}": step.rendered, "holes": holes, "completed": step.completed_rgb}
-    images |= {name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")}
+    images |= {
+        name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")
+    }
     if truth is not None:
         images["true"] = truth
         for name, rgb in {"rendered": step.rendered, "completed": step.completed_rgb}.items():
-            images[f"{name} - true, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
+            images[f"{name} - true, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(
+                0, 1
+            )
     return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 
@@ -180,4 +190,7 @@ def in_words(summary: MendSummary) -> list[str]:
         telea = summary.mean("telea", metric)
         lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
     lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
-    return [*lines, f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}"]
+    return [
+        *lines,
+        f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}",
+    ]

@@ -55,14 +55,23 @@ def run(options: Options) -> int:
         methods = paper.ablation_models(options.models)
     else:
         if options.table == 2 and not options.sets:
-            raise ValueError("expected captures for table 2, got none; give their folders: paper-table 2 CAPTURE ...")
+            raise ValueError(
+                "expected captures for table 2, got none; give their folders: paper-table 2 CAPTURE ..."
+            )
         if not options.ours.strip():
-            raise ValueError("expected --ours with a model's name or folder, got none; leave it out for the default")
+            raise ValueError(
+                "expected --ours with a model's name or folder, got none; leave it out for the default"
+            )
         ours = method_names(options.ours)
         trained = next((name for name in ours if paper.row_label(name).startswith(paper.PAPERS_MODEL)), None)
-        methods = {paper.OURS: () if trained is None else (trained,), "rgvi": ()}  # not RGVI without its networks
+        methods = {
+            paper.OURS: () if trained is None else (trained,),
+            "rgvi": (),
+        }  # not RGVI without its networks
         rows = [_relabelled(row, trained) for row in rows]
-        rows += [paper.PaperRow(paper.row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained]
+        rows += [
+            paper.PaperRow(paper.row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained
+        ]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]
     with report_folder(options.out):
         report = evaluate(options, sets, ",".join(dict.fromkeys(names)))

@@ -38,7 +38,9 @@ class Options:
     docs/live.md for the page, the time budget, single images over HTTP and live rigs.
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = "studio"
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = (
+        "studio"
+    )
     """A capture with masks; a TOML file that lists the cameras of a live rig (docs/guide/live-rig.md); 'studio' for a
     synthetic scene; or 'live' for a rig that pushes its frames."""
     format: str | None = None
@@ -143,7 +145,9 @@ def run(options: Options) -> int:
 def _check(options: Options) -> None:
     """Raise a ValueError for an option that is out of range, before anything heavy is imported."""
     at_least_1 = ("max_image_size", "viewers", "frames", "size", "memory_mb", "replicas")
-    check_least(options, **dict.fromkeys(at_least_1, 1), cameras=4, budget_ms=0, max_replicas=options.replicas)
+    check_least(
+        options, **dict.fromkeys(at_least_1, 1), cameras=4, budget_ms=0, max_replicas=options.replicas
+    )
     checks = [
         ("fps", options.fps is None or 0 < options.fps <= 240, "above 0 and at most 240"),
         ("port", 0 <= options.port <= 65535, "from 0 to 65535"),
@@ -179,7 +183,9 @@ def server_config(options: Options) -> "ServerConfig":
         model=options.model or default_method(),
         draws_in_page=options.render == "page",
         limits=Limits(viewers=options.viewers),
-        extensions=tuple(load_extension(name, values[name]) for name in EXTENSIONS if values[name] is not None),
+        extensions=tuple(
+            load_extension(name, values[name]) for name in EXTENSIONS if values[name] is not None
+        ),
     )
 
 
@@ -224,7 +230,9 @@ def open_source(options: Options) -> "FrameSource":
         rig_source: Callable[..., FrameSource] = import_object(RIG_SOURCE)
         return rig_source(Path(options.source), options.fps, memory_mb, size_px, **prepared)
     if options.source == "studio":
-        return RecordedSource(partial(_make_studio, options), options.fps, generated=True, memory_mb=memory_mb)
+        return RecordedSource(
+            partial(_make_studio, options), options.fps, generated=True, memory_mb=memory_mb
+        )
     from viewmend.cli.checks import log_preparation
     from viewmend.data.prepare import open_masked, prepare
 
@@ -241,7 +249,9 @@ def _make_studio(options: Options) -> "CaptureSource":
     from viewmend.studio.stage import Studio, StudioConfig
 
     seed = PROCEDURAL_SEEDS["test"][1] if options.seed is None else options.seed
-    config = StudioConfig(seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0)
+    config = StudioConfig(
+        seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
+    )
     return prepare(Studio(config), max_image_size=options.max_image_size, align=False, match_colours=False)
 
 
@@ -254,7 +264,9 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
 
     config = server_config(options)
     if not is_loopback(config.host):
-        say("Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)")
+        say(
+            "Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)"
+        )
     elsewhere: dict[str, Any] = {"source": _absolute(options.source)}
     elsewhere["view"] = replace(options.view, error_rule=_absolute(options.view.error_rule))
     if options.model not in (*shipped_models(), *METHODS):  # which a folder of the same name does not replace

@@ -44,7 +44,9 @@ def run(options: Options) -> int:
     try:
         re.compile(options.subject)
     except re.error as error:
-        raise ValueError(f"expected a regular expression for --subject, got '{options.subject}': {error}") from None
+        raise ValueError(
+            f"expected a regular expression for --subject, got '{options.subject}': {error}"
+        ) from None
     if not 0 < options.test_fraction < 1:
         raise ValueError(
             f"expected --test-fraction between 0 and 1, got {options.test_fraction}; the paper has 7 of 79"

@@ -56,7 +56,9 @@ def run(options: Options) -> int:
         remove_unfinished(folder)
     if any(existing := [folder.exists() for folder in folders]):
         first = folders[existing.index(True)]
-        raise CaptureError(f"{first}: expected a new folder, got an existing one; {_advice(options, existing)}")
+        raise CaptureError(
+            f"{first}: expected a new folder, got an existing one; {_advice(options, existing)}"
+        )
     same = ("cameras", "rig", "frames", "performers", "motions", "background")
     config = StudioConfig(
         **{name: getattr(options, name) for name in same},
@@ -66,7 +68,9 @@ def run(options: Options) -> int:
     report = []
     for seed, folder in zip(seeds, folders, strict=True):
         studio = Studio(replace(config, seed=seed))
-        write_capture(studio, folder, images=options.images, progress=lambda times, f=folder: track(times, f.name))
+        write_capture(
+            studio, folder, images=options.images, progress=lambda times, f=folder: track(times, f.name)
+        )
         say(f"{folder}: {studio.performer.description}")
         report.append({"folder": str(folder), "seed": seed, "performer": studio.performer.description})
     if options.json:

@@ -96,7 +96,9 @@ def run(options: Options) -> int:
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
     if number := stopped():
-        say(f"{options.out}: stopped after step {steps[0].step if steps else 0}; run the same command to resume")
+        say(
+            f"{options.out}: stopped after step {steps[0].step if steps else 0}; run the same command to resume"
+        )
         return 128 + number
     if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
         say(f"wrote {options.out}" if steps else f"{options.out}: this run is complete; nothing to do")
@@ -116,7 +118,11 @@ def _show_gain(options: Options) -> None:
 
     sheet = options.out / "comparison.png"
     say("comparing both models by camera")
-    print(compare(scenes.captures[0], scenes.hold_out, load_inpainter(start), load_inpainter(options.out), sheet))
+    print(
+        compare(
+            scenes.captures[0], scenes.hold_out, load_inpainter(start), load_inpainter(options.out), sheet
+        )
+    )
     print(f"views before and after: {sheet}")
 
 

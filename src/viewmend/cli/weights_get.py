@@ -28,7 +28,9 @@ def run(options: Options) -> int:
 
     unknown = [name for name in options.names if name not in PUBLISHED]
     if unknown or not options.names:
-        raise ValueError(f"expected weights among {', '.join(PUBLISHED)}, got {(unknown or ['none'])[0]}; name some")
+        raise ValueError(
+            f"expected weights among {', '.join(PUBLISHED)}, got {(unknown or ['none'])[0]}; name some"
+        )
     for name in options.names:
         say(f"{name}: from {PUBLISHED[name].package} {PUBLISHED[name].version}")
         path = get_weights(name, options.archive)

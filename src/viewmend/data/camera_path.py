@@ -56,11 +56,15 @@ def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3
     """
     try:
         content = read_json(bounded_bytes(file))
-        path: PathFile = typed(content if isinstance(content, dict) else {"world_from_camera": content}, PathFile)
+        path: PathFile = typed(
+            content if isinstance(content, dict) else {"world_from_camera": content}, PathFile
+        )
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     except OSError as error:
-        raise ValueError(f"{file}: expected a file with camera poses, got: {error.strerror}; check --path") from error
+        raise ValueError(
+            f"{file}: expected a file with camera poses, got: {error.strerror}; check --path"
+        ) from error
     poses = torch.tensor(path.world_from_camera, dtype=torch.float64)
     positions = poses[:, :3, 3]
     if origin_m is not None:

@@ -47,7 +47,10 @@ class CameraReader:
         own = {} if clock is None else clock.frames
         images = own.get((camera.name, "images"), numbers)
         masks = images if camera.video is None or self._has_mask_per_image() else numbers
-        self._index: dict[TrackKind, np.ndarray] = {"images": images, "masks": own.get((camera.name, "masks"), masks)}
+        self._index: dict[TrackKind, np.ndarray] = {
+            "images": images,
+            "masks": own.get((camera.name, "masks"), masks),
+        }
 
     def _has_mask_per_image(self) -> bool:
         """Whether numbered masks are those of the film's own frames, of which some of the capture's are missing."""
@@ -72,7 +75,11 @@ class CameraReader:
         """
         camera = self.camera
         path, where = self.locate("video" if camera.video else "image", time)
-        rgb = self._video.read(int(self._index["images"][time]), where) if self._video else read_rgb(path, where)
+        rgb = (
+            self._video.read(int(self._index["images"][time]), where)
+            if self._video
+            else read_rgb(path, where)
+        )
         if rgb is None:
             return None
         if not self._rotation_is_known:
@@ -97,7 +104,9 @@ class CameraReader:
         """Correct colours and distortion of another image of this camera, such as a clean plate."""
         return self._undistortion.apply(CameraImages(self._correct_colours(rgb), None, None)).rgb
 
-    def _correct_colours(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    def _correct_colours(
+        self, rgb: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
         return rgb if self._curves is None else cv2.LUT(rgb, self._curves)
 
     def _read_mask(self, path: Path, where: str, time: int) -> UInt8[np.ndarray, "height width"] | None:
@@ -124,7 +133,9 @@ class CameraReader:
         path = self._folder / self.camera.file(kind, self._file_id(kind, time))
         return path, f"{path}: camera '{self.camera.name}', frame '{self._frames[time]}'"
 
-    def _as_stored(self, mask: UInt8[np.ndarray, "rows columns"], path: Path) -> UInt8[np.ndarray, "height width"]:
+    def _as_stored(
+        self, mask: UInt8[np.ndarray, "rows columns"], path: Path
+    ) -> UInt8[np.ndarray, "height width"]:
         """A mask that lies as its image: another tool may have turned it as EXIF says, or not have turned it.
 
         A mask of the transposed size is turned back as the image's own EXIF says, or else as the mask's says.
@@ -151,6 +162,8 @@ class CameraReader:
         if (width, height) != (self.camera.width, self.camera.height):
             advice = "correct width, height and K in the calibration, or replace the file"
             if rotation:
-                advice = f"EXIF says that it should be {rotation}: make it upright (exiftran -ai), or {advice}"
+                advice = (
+                    f"EXIF says that it should be {rotation}: make it upright (exiftran -ai), or {advice}"
+                )
             expected = f"{self.camera.width} x {self.camera.height} pixels as in the calibration"
             raise CaptureError(f"{where}: expected {expected}, got {width} x {height}; {advice}")

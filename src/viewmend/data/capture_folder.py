@@ -110,14 +110,18 @@ class CaptureFolder:
         self.fps = calibration.fps
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
         corners = calibration.bounds_m
-        self.bounds = None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+        self.bounds = (
+            None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+        )
         self.origin_m = calibration.origin_m
         """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far from the folder's."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")
         self.has_depth = self._all_or_none("depth")
-        self._readers = tuple(CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries)
+        self._readers = tuple(
+            CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries
+        )
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
         self._label_masks = LabelMasks()
@@ -137,7 +141,8 @@ class CaptureFolder:
         listed = self._listed
         found = len(self.frame_ids)
         text = (
-            f"expected {listed} frames as listed, got videos with {found} common times; the other frames are left out"
+            f"expected {listed} frames as listed, got videos with {found} common times; "
+            "the other frames are left out"
         )
         return ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
 
@@ -148,7 +153,9 @@ class CaptureFolder:
         a file is unreadable or has the wrong size; IndexError if `time` is not in the capture.
         """
         if not 0 <= time < len(self.frame_ids):
-            raise IndexError(f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}")
+            raise IndexError(
+                f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}"
+            )
         views = [int(view) for view in np.flatnonzero(self.present[:, time])]
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
@@ -162,11 +169,15 @@ class CaptureFolder:
         frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
         if frame.mask is not None:
             frame = self._with_opaque_masks(frame)
-        if frame.mask is not None and not frame.has_subject:  # what remains is noise, as of a compressed video
+        if (
+            frame.mask is not None and not frame.has_subject
+        ):  # what remains is noise, as of a compressed video
             frame = replace(frame, mask=torch.zeros_like(frame.mask))
         return frame
 
-    def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    def undistort(
+        self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
         """Undistort another image of this camera, such as a clean plate; ValueError for another camera or size."""
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
@@ -201,7 +212,9 @@ class CaptureFolder:
         if missing and len(missing) < len(self._entries):
             expected = f"'{kind}' for every camera or for none"
             got = f"none for {', '.join(missing)}"
-            raise CaptureError(f"{self._file}: expected {expected}, got {got}; add it, or leave these cameras out")
+            raise CaptureError(
+                f"{self._file}: expected {expected}, got {got}; add it, or leave these cameras out"
+            )
         return not missing
 
     def _find_files(self) -> Bool[np.ndarray, "view time"]:
@@ -209,7 +222,9 @@ class CaptureFolder:
 
         def exists(path: str) -> bool:
             if not stays_inside(path):
-                raise CaptureError(f"{self.folder}: expected a file inside the folder, got {path}; rename the frame")
+                raise CaptureError(
+                    f"{self.folder}: expected a file inside the folder, got {path}; rename the frame"
+                )
             parent, name = os.path.split(path)
             return name in listing(parent)
 
@@ -226,7 +241,9 @@ class CaptureFolder:
                 frame = self.frame_ids[0]
                 where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
                 got = f"found none in {len(self.frame_ids)} frames"
-                next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
+                next_step = (
+                    f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
+                )
                 raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
         for time in np.flatnonzero(~present.any(0)).tolist():
             raise CaptureError(self._without_cameras(time, exists))
@@ -234,8 +251,12 @@ class CaptureFolder:
 
     def _without_cameras(self, time: int, exists: Callable[[str], bool]) -> str:
         """What is wrong with a frame in which no camera has all of its files, and what to do about it."""
-        kinds: list[FileKind] = [k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)]
-        own = {kind: [reader for reader in self._readers if kind in reader.camera.file_kinds] for kind in kinds}
+        kinds: list[FileKind] = [
+            k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)
+        ]
+        own = {
+            kind: [reader for reader in self._readers if kind in reader.camera.file_kinds] for kind in kinds
+        }
         absent: list[FileKind] = [k for k in kinds if all(reader.lacks(k, time, exists) for reader in own[k])]
         first: FileKind = (absent or kinds)[0]
         _, where = own[first][0].locate(first, time)
@@ -249,7 +270,9 @@ class CaptureFolder:
         return f"{where}: expected {wanted}, got {got}; {', or '.join(steps)}"
 
 
-def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[NativeCamera, ...]:
+def _select(
+    cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path
+) -> tuple[NativeCamera, ...]:
     if names is None:
         return cameras
     by_name = {camera.name: camera for camera in cameras}
@@ -292,8 +315,15 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     """
     cameras = calibration.cameras
     folder = calibration.folder
-    files = {(c.name, kind): path for c in cameras for kind, path in (("images", c.video), ("masks", c.mask)) if path}
-    films = {key: folder / path for key, path in files.items() if is_video(path) and (folder / path).is_file()}
+    files = {
+        (c.name, kind): path
+        for c in cameras
+        for kind, path in (("images", c.video), ("masks", c.mask))
+        if path
+    }
+    films = {
+        key: folder / path for key, path in files.items() if is_video(path) and (folder / path).is_file()
+    }
     if not films and not any(camera.offset_ms for camera in cameras):
         return None
     fps = calibration.fps or next((video_properties(path).fps for path in films.values()), None)

@@ -171,7 +171,9 @@ class ColourMatch:
         return replace(frame, rgb=rgb)
 
 
-def match_colours(frame: MultiViewFrame, bounds: Bounds | None, odd: Collection[str] = ()) -> ColourMatch | None:
+def match_colours(
+    frame: MultiViewFrame, bounds: Bounds | None, odd: Collection[str] = ()
+) -> ColourMatch | None:
     """Fit colour maps to the cameras of one frame with masks; None if too few cameras share surface.
 
     `odd` cameras have no effect on the others: they are matched to them afterwards, if a map can do it.
@@ -265,7 +267,9 @@ def _solve(values: Float[Tensor, "view point 4"], weight: Float[Tensor, "view po
     mean = torch.eye(4).to(normal).repeat(1, views)
     constraint = torch.cat([mean, mean.new_zeros(4, 4)], 1)  # the mean map is the identity
     system = torch.cat([torch.cat([normal + regularisation, mean.mT], 1), constraint])
-    change = torch.linalg.solve(system, torch.cat([-normal @ identity[:, :3], identity.new_zeros(4, 3)]))[: 4 * views]
+    change = torch.linalg.solve(system, torch.cat([-normal @ identity[:, :3], identity.new_zeros(4, 3)]))[
+        : 4 * views
+    ]
     return rearrange(identity[:, :3] + change, "(view k) channel -> view channel k", k=4)
 
 

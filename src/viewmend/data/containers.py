@@ -52,7 +52,9 @@ def names_in(folder: Path) -> frozenset[str]:
         with open_container(file) as root:
             group = member(root, folder.relative_to(file).parts)
             members = group if hasattr(group, "keys") else ()
-            return frozenset(name for name in members if isinstance(name, str))  # h5py returns bytes for invalid UTF-8
+            return frozenset(
+                name for name in members if isinstance(name, str)
+            )  # h5py returns bytes for invalid UTF-8
     except OSError:
         return frozenset()
 
@@ -67,7 +69,9 @@ def read_bytes(path: Path, count: int | None = None) -> bytes:
         data = member(root, path.relative_to(file).parts)
         size = getattr(data, "size", None)  # groups and named types have none
         if size is None or size > MAX_BYTES or data.dtype not in (np.uint8, np.int8):
-            raise ValueError(f"{path}: expected the bytes of an image, got something else; copy the file again")
+            raise ValueError(
+                f"{path}: expected the bytes of an image, got something else; copy the file again"
+            )
         return np.asarray(data[()] if count is None or data.ndim != 1 else data[:count]).tobytes()
 
 

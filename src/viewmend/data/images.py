@@ -49,7 +49,9 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
         bgr = (bgr >> 8).astype(np.uint8)
     if bgr.dtype != np.uint8:
         got = f"{bgr.dtype} with values up to {bgr.max():g}"
-        raise CaptureError(f"{where}: expected 8 bit, or 16 bit in full range, got {got}; write it as 8-bit PNG")
+        raise CaptureError(
+            f"{where}: expected 8 bit, or 16 bit in full range, got {got}; write it as 8-bit PNG"
+        )
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
@@ -113,7 +115,9 @@ def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
         bgra = (bgra >> 8).astype(np.uint8)
     if channels != 4 or bgra.dtype != np.uint8:
         got = f"{channels} channels" + ("" if bgra.dtype == np.uint8 else f" of {bgra.dtype}")
-        raise CaptureError(f"{where}: expected RGB and alpha, got {got}; export it with alpha, or leave the camera out")
+        raise CaptureError(
+            f"{where}: expected RGB and alpha, got {got}; export it with alpha, or leave the camera out"
+        )
     return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
 
 
@@ -122,7 +126,9 @@ def read_alpha(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     alpha = read_rgba(path, where)[..., 3]
     if is_opaque(alpha):
         next_step = "export it with alpha, or leave the camera out"
-        raise CaptureError(f"{where}: expected alpha that cuts out the subject, got an opaque image; {next_step}")
+        raise CaptureError(
+            f"{where}: expected alpha that cuts out the subject, got an opaque image; {next_step}"
+        )
     return alpha
 
 
@@ -182,8 +188,12 @@ def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: st
     if len(colours) > MAX_LABELS or np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) < 2:
         return None
     if colours[0]:
-        found = ", ".join(f"{colour & 255} {colour >> 8 & 255} {colour >> 16}" for colour in colours[:3].tolist())
-        raise CaptureError(f"{where}: expected black as a mask's background, got the colours {found}; write 0 and 255")
+        found = ", ".join(
+            f"{colour & 255} {colour >> 8 & 255} {colour >> 16}" for colour in colours[:3].tolist()
+        )
+        raise CaptureError(
+            f"{where}: expected black as a mask's background, got the colours {found}; write 0 and 255"
+        )
     return (0, 0, 0)
 
 
@@ -222,7 +232,9 @@ def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
     depth = _decode(_read_file(path, where), where, cv2.IMREAD_UNCHANGED)
     if depth.dtype != np.uint16 or depth.ndim != 2:
         got = f"{depth.dtype} of shape {depth.shape}"
-        raise CaptureError(f"{where}: expected one channel of 16-bit millimetres, got {got}; write it as 16-bit PNG")
+        raise CaptureError(
+            f"{where}: expected one channel of 16-bit millimetres, got {got}; write it as 16-bit PNG"
+        )
     return depth.astype(np.float32) / DEPTH_UNITS_PER_M
 
 
@@ -239,7 +251,9 @@ def _read_file(path: Path, where: str) -> bytes:
     try:
         return read_bytes(path)
     except OSError as error:
-        raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
+        raise CaptureError(
+            f"{where}: expected a readable file, got: {error.strerror}; check its permissions"
+        ) from None
 
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
@@ -313,7 +327,9 @@ def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> Non
     """Write z-depth in metres as a 16-bit PNG of millimetres, rounded; CaptureError beyond 0 to 65.535 m."""
     if not ((depth_m >= 0) & (depth_m <= MAX_DEPTH_M)).all():
         got = f"{np.nanmin(depth_m)} to {np.nanmax(depth_m)} m"
-        raise CaptureError(f"{path}: expected depths of 0 to {MAX_DEPTH_M} m, got {got}; check the scene's units")
+        raise CaptureError(
+            f"{path}: expected depths of 0 to {MAX_DEPTH_M} m, got {got}; check the scene's units"
+        )
     _write(path, np.rint(depth_m * DEPTH_UNITS_PER_M).astype(np.uint16), ())
 
 

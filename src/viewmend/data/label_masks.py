@@ -59,7 +59,11 @@ class LabelMasks:
         self._seen_opaque = self._seen_opaque or max(highest) >= self._rule.opaque
         if self._seen_opaque:
             views = _views_with_one_label(mask, highest, self._rule)
-            return _from_labels(mask, views, tuple(views), max(highest[view] for view in views)) if views else None
+            return (
+                _from_labels(mask, views, tuple(views), max(highest[view] for view in views))
+                if views
+                else None
+            )
         if not any(highest):
             return None
         count = len(torch.bincount(mask.flatten(), minlength=256).nonzero())
@@ -87,7 +91,9 @@ def _views_with_one_label(mask: Masks, highest: Sequence[int], rule: LabelMaskRu
     return found
 
 
-def _from_labels(mask: Masks, views: Sequence[int], named: tuple[int, ...] | None, highest: int) -> ConvertedMasks:
+def _from_labels(
+    mask: Masks, views: Sequence[int], named: tuple[int, ...] | None, highest: int
+) -> ConvertedMasks:
     converted = mask.clone()
     chosen = list(views)
     converted[chosen] = 255 * (mask[chosen] > 0).to(torch.uint8)

@@ -50,12 +50,16 @@ class _CameraEntry(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
             expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
-            raise _invalid("K", expected, shown(self.K), "convert the calibration to OpenCV's convention, in pixels")
+            raise _invalid(
+                "K", expected, shown(self.K), "convert the calibration to OpenCV's convention, in pixels"
+            )
         R = np.array(self.R)
         if not bool(is_rotation(torch.from_numpy(R), ROTATION_TOLERANCE)):
             off = abs(R @ R.T - np.eye(3)).max()
             got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {off:.2g}, {shown(self.R)}"
-            raise _invalid("R", "a rotation, world to camera", got, "check axes, signs and the number of digits")
+            raise _invalid(
+                "R", "a rotation, world to camera", got, "check axes, signs and the number of digits"
+            )
         if (self.image is None) == (self.video is None):
             got = "neither" if self.image is None else "both"
             raise _invalid("image", "either 'image' or 'video'", got, "name one of the two")
@@ -78,15 +82,24 @@ class _File(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.bounds is not None and not all(low < high for low, high in zip(*self.bounds, strict=True)):
-            raise _invalid("bounds", "[low corner, high corner]", shown(self.bounds), "put the smaller numbers first")
+            raise _invalid(
+                "bounds", "[low corner, high corner]", shown(self.bounds), "put the smaller numbers first"
+            )
         if self.up is not None and not any(self.up):
             raise _invalid("up", "a direction or null", shown(self.up), "write null if it is unknown")
         if len(self.cameras) < 2:
-            raise _invalid("cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras")
-        for key, names in (("frames", self.frames), ("cameras", tuple(camera.name for camera in self.cameras))):
+            raise _invalid(
+                "cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras"
+            )
+        for key, names in (
+            ("frames", self.frames),
+            ("cameras", tuple(camera.name for camera in self.cameras)),
+        ):
             repeated = sorted(name for name, count in Counter(names).items() if count > 1)[:5]
             if repeated:
-                raise _invalid(key, "different names", f"{repeated} more than once", "rename or remove the duplicates")
+                raise _invalid(
+                    key, "different names", f"{repeated} more than once", "rename or remove the duplicates"
+                )
 
 
 @dataclass(frozen=True)
@@ -245,7 +258,12 @@ def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
 
 def _entry(camera: NativeCamera) -> dict[str, Any]:
     entry: dict[str, Any] = {"name": camera.name, "width": camera.width, "height": camera.height}
-    entry |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t_m.tolist(), "dist": camera.dist.tolist()}
+    entry |= {
+        "K": camera.K.tolist(),
+        "R": camera.R.tolist(),
+        "t": camera.t_m.tolist(),
+        "dist": camera.dist.tolist(),
+    }
     entry |= {kind: getattr(camera, kind) for kind in camera.file_kinds}
     if camera.colour is not None:
         entry["colour"] = camera.colour.tolist()
@@ -259,7 +277,9 @@ def _check_keys(content: dict[str, Any]) -> None:
     version = content.get("format")
     if version != FORMAT:
         got = "nothing" if version is None else shown(version)
-        raise _invalid("format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it")
+        raise _invalid(
+            "format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it"
+        )
     _check_spelling(content, _File.__struct_fields__)
     for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
         if isinstance(entry, dict):
@@ -283,4 +303,6 @@ def stays_inside(path: str) -> bool:
     """Whether a relative path cannot leave its folder: it is not absolute and has no drive and no `..`."""
     posix = PurePosixPath(path)
     windows = PureWindowsPath(path)
-    return not (posix.is_absolute() or windows.drive or windows.root or ".." in windows.parts or not posix.parts)
+    return not (
+        posix.is_absolute() or windows.drive or windows.root or ".." in windows.parts or not posix.parts
+    )

@@ -76,7 +76,9 @@ def atomic_folder(out: Path | str) -> Iterator[Path]:
     """
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise CaptureError(f"{out}: expected a new or empty folder, got one in use; remove it or choose another")
+        raise CaptureError(
+            f"{out}: expected a new or empty folder, got one in use; remove it or choose another"
+        )
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.parent / f".{out.name}.unfinished-{os.getpid()}"
     remove_unfinished(out)
@@ -121,7 +123,11 @@ class _Writer:
         empty = []
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             for frame in prefetch(self.source, times):
-                list(pool.map(lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))))
+                list(
+                    pool.map(
+                        lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))
+                    )
+                )
                 empty += [frame.time] if frame.mask is not None and not frame.has_subject else []
         write_calibration(self.folder, self._calibration())
         return tuple(empty)
@@ -135,7 +141,9 @@ class _Writer:
             self.kinds.add(kind)
             return self.folder / self._path(name, kind).replace("{frame}", frame_id)
 
-        write_image(file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy())
+        write_image(
+            file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
+        )
         if frame.mask is not None:
             write_image(file("mask"), frame.mask[view, :height, :width].contiguous().cpu().numpy())
         if frame.depth is not None:
@@ -151,7 +159,9 @@ class _Writer:
         K = cameras.K.double().numpy()
         pose = cameras.camera_from_world.double().numpy()
         entries = []
-        for view, (name, (width, height)) in enumerate(zip(cameras.names, cameras.size_px.tolist(), strict=True)):
+        for view, (name, (width, height)) in enumerate(
+            zip(cameras.names, cameras.size_px.tolist(), strict=True)
+        ):
             files: Any = {kind: self._path(name, kind) if kind in self.kinds else None for kind in FILE_KINDS}
             R = pose[view, :3, :3]
             t_m = pose[view, :3, 3]
@@ -161,7 +171,9 @@ class _Writer:
             cameras=tuple(entries),
             up=None if source.up is None else source.up.double().cpu().numpy(),
             fps=source.fps,
-            bounds_m=None if bounds is None else torch.stack([bounds.low, bounds.high]).double().cpu().numpy(),
+            bounds_m=None
+            if bounds is None
+            else torch.stack([bounds.low, bounds.high]).double().cpu().numpy(),
             metres_per_unit=1.0,
             file=self.folder / CALIBRATION,
             folder=self.folder,

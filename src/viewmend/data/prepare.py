@@ -80,9 +80,15 @@ class PreparedCapture(CaptureWrapper):
         frame = frame.without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
-        text = "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
-        issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
-        good = [name for name in frame.cameras.names if name in inputs and all(name != i.camera for i in issues)]
+        text = (
+            "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
+        )
+        issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(
+            frame, inputs, self.bounds
+        )
+        good = [
+            name for name in frame.cameras.names if name in inputs and all(name != i.camera for i in issues)
+        ]
         issues += find_blank_images(frame.select(good))
         bad = [issue.camera for issue in issues if issue.camera]
         where = f"{self.name}: {label}"

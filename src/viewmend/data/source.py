@@ -166,7 +166,9 @@ def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Itera
     pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
     try:
         while True:
-            pending.extend(pool.submit(source.read, time) for time in islice(coming, FRAMES_AHEAD + 1 - len(pending)))
+            pending.extend(
+                pool.submit(source.read, time) for time in islice(coming, FRAMES_AHEAD + 1 - len(pending))
+            )
             if not pending:
                 return
             yield pending.popleft().result()
@@ -183,7 +185,9 @@ def limit_camera_size(cameras: Cameras, max_image_size: int | None) -> Cameras:
     """Reduce each camera to at most this length of its longer side; returns `cameras` if none is larger."""
     if max_image_size is None:
         return cameras
-    return scale_cameras(cameras, *(min(1.0, max_image_size / max(size)) for size in cameras.size_px.tolist()))
+    return scale_cameras(
+        cameras, *(min(1.0, max_image_size / max(size)) for size in cameras.size_px.tolist())
+    )
 
 
 def scale_cameras(cameras: Cameras, *scales: float) -> Cameras:

@@ -152,20 +152,32 @@ class VideoClock:
             images = [other for other in images if other.camera == track.camera]
             than = "the images'"
             if track.camera in self.by_index:
-                return [f"{what} have other times than the images, but as many frames; they are matched one to one"]
+                return [
+                    f"{what} have other times than the images, but as many frames; they are matched one to one"
+                ]
             if np.array_equal(track.times_s, images[0].times_s):
                 return []
         if track.kind == "images" and not track.is_timed:
-            faults.append(f"{what} have no times in their files; they are matched by index at {own_fps(track):.4g} fps")
+            faults.append(
+                f"{what} have no times in their files; they are matched by index at {own_fps(track):.4g} fps"
+            )
         if (track.camera, track.kind) in self.moved:
             faults.append(f"{what} have no time in common with {than}; they are taken to start together")
         own_rate = track.fps or rate
         fastest = rate * (1 + RATE_TOLERANCE)
-        text = f"{what} have {own_rate:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+        text = (
+            f"{what} have {own_rate:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+        )
         if own_rate < rate * (1 - RATE_TOLERANCE):
             faults.append(f"{text}, and the camera is absent in between")
-        if track.kind == "images" and own_rate > fastest and sum((other.fps or 0) > fastest for other in images) > 1:
-            faults.append(f"{text}, and their frames in between are not used; leave out the slow cameras to use them")
+        if (
+            track.kind == "images"
+            and own_rate > fastest
+            and sum((other.fps or 0) > fastest for other in images) > 1
+        ):
+            faults.append(
+                f"{text}, and their frames in between are not used; leave out the slow cameras to use them"
+            )
         if track.gaps:
             lost = sum(count for _, count in track.gaps)
             from_s = track.gaps[0][0]
@@ -210,7 +222,9 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
     tracks, timecodes = _by_timecode(tracks)
     images = {track.camera: track for track in tracks if track.kind == "images"}
-    order = sorted(images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
+    order = sorted(
+        images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True
+    )
     rate = round(order[len(order) // 2].fps or 0.0, 1)
     reference = next(track for track in order if round(track.fps or 0.0, 1) == rate)
     period_s = 1 / (reference.fps or 1.0)
@@ -240,13 +254,19 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
         index = _nearest(own, times)
         is_near = np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6
         found[track.camera, track.kind] = np.where(is_near, index, ABSENT)
-    complete = [np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images]
+    complete = [
+        np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images
+    ]
     kept = np.sum(complete, axis=0) >= min(2, len(images))
     if not kept.any():
-        raise ValueError("expected at least two videos that overlap in time, got none; check their times and offset_ms")
+        raise ValueError(
+            "expected at least two videos that overlap in time, got none; check their times and offset_ms"
+        )
     times = times[kept]
     frames = {key: index[kept] for key, index in found.items()}
-    ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
+    ends = [
+        own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)
+    ]
     end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
     return VideoClock(
         tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index), timecodes
@@ -284,7 +304,10 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
     differ = f"the films' timecodes start up to {apart_s:.2f} s apart (first '{first}', last '{last}')"
     without = [track.camera for track in films if track.camera not in starts]
     if without:
-        return tracks, f"{differ}, but {_named(without)} has none; films are taken to start together, see offset_ms"
+        return (
+            tracks,
+            f"{differ}, but {_named(without)} has none; films are taken to start together, see offset_ms",
+        )
     shift = {name: start - starts[first] for name, start in starts.items()}
     ends = [float(track.times_s[-1]) + shift[track.camera] for track in films]
     if min(ends) < max(float(track.times_s[0]) + shift[track.camera] for track in films):
@@ -295,10 +318,15 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
         from_s = shift[track.camera] if track.kind == "images" or own is None else own - starts[first]
         moved.append(replace(track, times_s=track.times_s + from_s))
     remove = "ffmpeg -i IN -map 0:v -c copy -write_tmcd 0 OUT"
-    return moved, f"{differ}; they are matched by timecode; if they were cut to start together, remove it ({remove})"
+    return (
+        moved,
+        f"{differ}; they are matched by timecode; if they were cut to start together, remove it ({remove})",
+    )
 
 
-def _nearest(times: Float64[np.ndarray, "time"], wanted: Float64[np.ndarray, "frame"]) -> Int[np.ndarray, "frame"]:
+def _nearest(
+    times: Float64[np.ndarray, "time"], wanted: Float64[np.ndarray, "frame"]
+) -> Int[np.ndarray, "frame"]:
     """Index of the time nearest to each wanted one."""
     return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
 

@@ -27,9 +27,53 @@ if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 VIDEO_SUFFIXES = (
-    *(".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts", ".mxf", ".flv"),
-    *(".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".mjpg", ".mjpeg", ".m2v", ".ivf", ".obu", ".y4m", ".nut"),
-    *(".3gp", ".3g2", ".asf", ".dv", ".f4v", ".m2t", ".mod", ".tod", ".mpe", ".mpv", ".ogv", ".qt", ".vob", ".gxf"),
+    *(
+        ".mp4",
+        ".avi",
+        ".mkv",
+        ".mov",
+        ".webm",
+        ".m4v",
+        ".mpg",
+        ".mpeg",
+        ".wmv",
+        ".ts",
+        ".mts",
+        ".m2ts",
+        ".mxf",
+        ".flv",
+    ),
+    *(
+        ".h264",
+        ".264",
+        ".avc",
+        ".h265",
+        ".265",
+        ".hevc",
+        ".mjpg",
+        ".mjpeg",
+        ".m2v",
+        ".ivf",
+        ".obu",
+        ".y4m",
+        ".nut",
+    ),
+    *(
+        ".3gp",
+        ".3g2",
+        ".asf",
+        ".dv",
+        ".f4v",
+        ".m2t",
+        ".mod",
+        ".tod",
+        ".mpe",
+        ".mpv",
+        ".ogv",
+        ".qt",
+        ".vob",
+        ".gxf",
+    ),
 )
 """Suffixes of containers, of raw streams, and of camcorders."""
 SMPTE170M = 6
@@ -150,7 +194,9 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
     )
 
 
-def _timestamps(path: Path, packets: list[tuple[int | None, bool]], head: list[int | None]) -> tuple[int, ...] | None:
+def _timestamps(
+    path: Path, packets: list[tuple[int | None, bool]], head: list[int | None]
+) -> tuple[int, ...] | None:
     """The times of all frames by their packets; None if packets and the frames at the start and the end differ."""
     times = sorted(time for time, _ in packets if time is not None)
     if len(set(times)) != len(packets) or head[0] is None:
@@ -158,14 +204,18 @@ def _timestamps(path: Path, packets: list[tuple[int | None, bool]], head: list[i
     times = times[bisect_left(times, head[0]) :]  # earlier ones lack the frames that they are predicted from
     if times[: len(head)] != head:
         return None
-    last_key = max((time for time, key in packets if key and time is not None and time >= times[0]), default=times[0])
+    last_key = max(
+        (time for time, key in packets if key and time is not None and time >= times[0]), default=times[0]
+    )
     tail = [frame.pts for frame in _decoded(path, last_key) if frame.pts is not None]
     if last_key not in tail:
         return None
     return tuple(times[: bisect_left(times, last_key)] + tail[tail.index(last_key) :])
 
 
-def _measured_rate(seconds: Float64[np.ndarray, "frame"], declared: float | None, resolution_s: float) -> float | None:
+def _measured_rate(
+    seconds: Float64[np.ndarray, "frame"], declared: float | None, resolution_s: float
+) -> float | None:
     """Frames per second between gaps; the declared rate if that is as close as the resolution of the times allows."""
     if len(seconds) < 2:
         return declared
@@ -182,9 +232,13 @@ def _open_video(path: Path) -> "InputContainer":
     try:
         container = av.open(str(path), metadata_errors="ignore")
     except FileNotFoundError:
-        raise CaptureError(f"{path}: expected a video, got: No such file or directory; check the path") from None
+        raise CaptureError(
+            f"{path}: expected a video, got: No such file or directory; check the path"
+        ) from None
     except (av.FFmpegError, OSError, ValueError):
-        raise CaptureError(f"{path}: expected a video, got a file that no decoder opens; export it again") from None
+        raise CaptureError(
+            f"{path}: expected a video, got a file that no decoder opens; export it again"
+        ) from None
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{path}: expected a video, got a file without one; export it again")
@@ -251,7 +305,9 @@ def _deinterlaced(frames: "Iterator[VideoFrame]") -> "Iterator[VideoFrame]":
     graph = Graph()
     base = first.time_base or Fraction(1, 25)
     source = graph.add_buffer(width=first.width, height=first.height, format=first.format, time_base=base)
-    graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:parity=auto:deint=all"), graph.add("buffersink"))
+    graph.link_nodes(
+        source, graph.add("bwdif", "mode=send_frame:parity=auto:deint=all"), graph.add("buffersink")
+    )
     graph.configure()
     for frame in chain([first], frames, [None]):
         graph.push(frame)
@@ -396,7 +452,9 @@ class VideoWriter:
         if not self._started:
             self._stream.height, self._stream.width = image.shape[:2]
             self._started = True
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgba" if self._alpha else "rgb24")
+        frame = VideoFrame.from_ndarray(
+            np.ascontiguousarray(image), format="rgba" if self._alpha else "rgb24"
+        )
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:

@@ -56,7 +56,9 @@ class Records:
 
     def where(self, **facts: str) -> "Records":
         """The records whose fields have these values."""
-        return Records(tuple(r for r in self.all if all(getattr(r, name) == fact for name, fact in facts.items())))
+        return Records(
+            tuple(r for r in self.all if all(getattr(r, name) == fact for name, fact in facts.items()))
+        )
 
     def by_scene(self, metric: str, region: str) -> dict[str, float]:
         """Values by scene, of the records of one method."""
@@ -136,7 +138,11 @@ def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
 def gains(own: Records, other: Records) -> dict[str, float]:
     """Gain of one method's PSNR in the holes over another's, by scene, where both have a score."""
     reference = other.by_scene("psnr", "holes")
-    return {scene: db - reference[scene] for scene, db in own.by_scene("psnr", "holes").items() if scene in reference}
+    return {
+        scene: db - reference[scene]
+        for scene, db in own.by_scene("psnr", "holes").items()
+        if scene in reference
+    }
 
 
 def mean(values: Iterable[float | None]) -> float | None:
@@ -147,10 +153,15 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 def vfid(cells: Sequence[Cell]) -> dict[str, float | None]:
     """Distance between all videos of these cells and those of the truth."""
-    pairs = [(c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None]
+    pairs = [
+        (c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None
+    ]
     if not pairs:
         return dict.fromkeys(KINDS)
-    sides = {kind: [torch.from_numpy(np.concatenate([p[n][kind] for p in pairs])) for n in (0, 1)] for kind in KINDS}
+    sides = {
+        kind: [torch.from_numpy(np.concatenate([p[n][kind] for p in pairs])) for n in (0, 1)]
+        for kind in KINDS
+    }
     return {kind: frechet_distance(*side) for kind, side in sides.items()}
 
 
@@ -177,7 +188,9 @@ def _records_of_cell(cell: Cell) -> Iterator[Record]:
         enough[origin] = [frame for frame in cell.frames if getattr(frame, f"{origin}_px") >= MIN_HOLE_PX]
     names = [f.name for f in fields(ViewScores) if f.name != "time" and not f.name.endswith("_px")]
     figures = {
-        _metric_and_region(name): mean(getattr(frame, name) for frame in enough.get(name.split("_")[-1], cell.frames))
+        _metric_and_region(name): mean(
+            getattr(frame, name) for frame in enough.get(name.split("_")[-1], cell.frames)
+        )
         for name in names
     }
     figures["hole_fraction", "hull"] = mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in cell.frames)
@@ -206,7 +219,9 @@ def _composition(frames: Sequence[ViewScores]) -> dict[str, float | None]:
 
 def _metric_and_region(name: str) -> tuple[str, str]:
     region = next((region for region in REGIONS if name.endswith(f"_{region}")), None)
-    return IRREGULAR.get(name) or ((name, "holes") if region is None else (name.removesuffix(f"_{region}"), region))
+    return IRREGULAR.get(name) or (
+        (name, "holes") if region is None else (name.removesuffix(f"_{region}"), region)
+    )
 
 
 def _table(title: str, cells: Sequence[Cell], methods: Sequence[str]) -> Table:
@@ -252,7 +267,9 @@ def _overall(per_set: Sequence[Table], cells: Sequence[Cell]) -> Table:
                 speed=speed([c for c in cells if c.key.method == name and c.error is None]),
             )
         )
-    frames, thin, empty = (sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames"))
+    frames, thin, empty = (
+        sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames")
+    )
     sizes = dict.fromkeys(size for table in per_set for size in table.sizes_px)
     return Table("mean of the sets", tuple(rows), frames, thin, empty, tuple(sizes))
 

@@ -77,7 +77,9 @@ def training_of(folder: Path) -> Training | None:
     """The training of the model in a folder; None if its card does not say."""
     card = folder / CARD
     text = " ".join(card.read_text("utf-8", "replace").split()) if card.is_file() else ""
-    found = re.search(r"Trained by `viewmend train ([\w-]+)` from (random weights|`[^`]*`): .*? in (\d+) minutes", text)
+    found = re.search(
+        r"Trained by `viewmend train ([\w-]+)` from (random weights|`[^`]*`): .*? in (\d+) minutes", text
+    )
     if found is None:
         return None
     return Training(found[1], None if found[2] == "random weights" else found[2].strip("`"), int(found[3]))

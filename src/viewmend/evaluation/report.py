@@ -6,7 +6,16 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 
-from viewmend.evaluation.averages import Record, Records, Row, Table, frames_with_holes, records, speed, tables
+from viewmend.evaluation.averages import (
+    Record,
+    Records,
+    Row,
+    Table,
+    frames_with_holes,
+    records,
+    speed,
+    tables,
+)
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import PROTOCOL, Cell
 from viewmend.evaluation.scene_run import RunSettings
@@ -90,7 +99,12 @@ SPREAD = (
 EMPTY = ("", "-", "n/a", "0")
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
 """Readings of each score: heading, region."""
-SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))
+SCORES = (
+    ("PSNR", "psnr", 2),
+    ("SSIM", "ssim", 5),
+    ("LPIPS Alex", "lpips_alex", 4),
+    ("LPIPS VGG", "lpips_vgg", 4),
+)
 """Heading, metric, decimals."""
 VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
 
@@ -179,7 +193,11 @@ def holes_line(table: Table) -> str:
         next((v for row in table.rows if (v := row.scores.mean("hole_fraction", of)) is not None), None)
         for of in ("hull", "image", "only_past")
     )
-    past = f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past" if of_surface else ""
+    past = (
+        f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past"
+        if of_surface
+        else ""
+    )
     composition = _composition_line(table)
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
@@ -190,10 +208,14 @@ def holes_line(table: Table) -> str:
 
 def _composition_line(table: Table) -> str:
     """What the holes are made of; "" if it is not known."""
-    scores = next((row.scores for row in table.rows if row.scores.mean("share_of_holes", "phantom") is not None), None)
+    scores = next(
+        (row.scores for row in table.rows if row.scores.mean("share_of_holes", "phantom") is not None), None
+    )
     if scores is None:
         return ""
-    shares = {kind: scores.mean("share_of_holes", kind) or 0.0 for kind in ("phantom", "sources", "others", "past")}
+    shares = {
+        kind: scores.mean("share_of_holes", kind) or 0.0 for kind in ("phantom", "sources", "others", "past")
+    }
     never = 1 - sum(shares.values())
     return (
         f" Of the hole pixels, {shares['phantom']:.0%} are phantoms (the truth is background), {shares['sources']:.0%} "
@@ -208,9 +230,20 @@ def main_grid(table: Table) -> Grid:
 
     The best of several values is bold, and mean scores have their standard error over the scenes.
     """
-    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "VFID", "ms", "ms p95", "scenes", "failed")
+    heads = (
+        "method",
+        f"over {REFERENCE}",
+        *(c[0] for c in COLUMNS),
+        "VFID",
+        "ms",
+        "ms p95",
+        "scenes",
+        "failed",
+    )
     best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
-    return _without_empty_columns(Grid(heads, tuple(_method_row(row, len(heads), best) for row in table.rows)))
+    return _without_empty_columns(
+        Grid(heads, tuple(_method_row(row, len(heads), best) for row in table.rows))
+    )
 
 
 def _without_empty_columns(grid: Grid) -> Grid:
@@ -255,11 +288,19 @@ def readings_grid(table: Table) -> Grid:
 
 def scenes_grid(report: Report) -> Grid:
     """PSNR in the holes of each scene."""
-    holes = {(r.scene, r.method): number(r.value, 1, 2) for r in report.scores.where(metric="psnr", region="holes")}
-    cells = {(c.key.scene, c.key.method): "-" if c.error is None else "**failed**" for c in report.cells} | holes
+    holes = {
+        (r.scene, r.method): number(r.value, 1, 2) for r in report.scores.where(metric="psnr", region="holes")
+    }
+    cells = {
+        (c.key.scene, c.key.method): "-" if c.error is None else "**failed**" for c in report.cells
+    } | holes
     shares = report.scores.by_scene("hole_fraction", "hull")
     rows = [
-        (scene, number(shares.get(scene), 100, 2), *(cells.get((scene, method), "n/a") for method in report.methods))
+        (
+            scene,
+            number(shares.get(scene), 100, 2),
+            *(cells.get((scene, method), "n/a") for method in report.methods),
+        )
         for scene in dict.fromkeys(scene for scene, _ in cells)
     ]
     return Grid(("scene", "holes, % of the hull", *report.methods), tuple(rows))
@@ -289,7 +330,9 @@ def blocks(report: Report) -> list[Block]:
     if missing := not_available(report):
         parts += ["## Not available", missing]
     parts += ["## Scenes", "PSNR in the holes, dB.", scenes_grid(report)]
-    failed = [printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in report.cells if c.error is not None]
+    failed = [
+        printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in report.cells if c.error is not None
+    ]
     if failed:
         parts += ["## Failed", failed]
     parts += ["## What the figures mean", list(RULES)]
@@ -310,7 +353,9 @@ def summary(report: Report) -> list[Block]:
 def markdown_table(grid: Grid) -> str:
     """A grid as a Markdown table."""
     lines = [grid.heads, ["---"] * len(grid.heads), *grid.rows]
-    return "\n".join("| " + " | ".join(printable(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(printable(cell).replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
 
 
 def report_json(report: Report) -> str:

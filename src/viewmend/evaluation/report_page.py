@@ -81,7 +81,9 @@ def largest_hole(error: Picture) -> tuple[int, int, int]:
     import cv2
 
     height, width = error.shape[:2]
-    count, _, stats, _ = cv2.connectedComponentsWithStats((error[..., 0] > 0).astype(np.uint8), connectivity=8)
+    count, _, stats, _ = cv2.connectedComponentsWithStats(
+        (error[..., 0] > 0).astype(np.uint8), connectivity=8
+    )
     smallest = max(1, min(height, width) // CLOSE_UP_SHARE)
     x = 0
     y = 0
@@ -104,7 +106,9 @@ def _first_scenes(cells: Sequence[Cell], count: int) -> list[str]:
     return [scene for scenes in of.values() for scene in list(scenes)[:count]]
 
 
-def _columns(cells: Sequence[Cell], shared: SceneImages, store: CellStore) -> list[tuple[str, Picture | None]]:
+def _columns(
+    cells: Sequence[Cell], shared: SceneImages, store: CellStore
+) -> list[tuple[str, Picture | None]]:
     """A scene's images with labels: rendered, E, each method, truth; None for a method that failed."""
     shown: list[tuple[str, Picture | None]] = [("rendered", shared.rendered), ("E", shared.error)]
     for cell in cells:
@@ -129,5 +133,7 @@ def _html(block: Block) -> str:
 
 def _row(line: Sequence[str], kind: str) -> str:
     texts = (escape(cell.strip("*")) for cell in line)
-    marked = (f"<strong>{text}</strong>" if "**" in cell else text for cell, text in zip(line, texts, strict=True))
+    marked = (
+        f"<strong>{text}</strong>" if "**" in cell else text for cell, text in zip(line, texts, strict=True)
+    )
     return f"<tr>{''.join(f'<{kind}>{text}</{kind}>' for text in marked)}</tr>"

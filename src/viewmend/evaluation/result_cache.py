@@ -29,7 +29,13 @@ from viewmend.utils.untrusted_input import typed
 PROTOCOL = 6
 """Increased whenever synthetic scenes, renderer or scores change, so that old cells are not mixed with new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
-DAMAGED += (RuntimeError, MemoryError, SyntaxError, TokenError, OverflowError)  # NotImplementedError is a RuntimeError
+DAMAGED += (
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    TokenError,
+    OverflowError,
+)  # NotImplementedError is a RuntimeError
 """Exceptions that a damaged .npz file raises."""
 
 
@@ -124,7 +130,11 @@ class CellStore:
     def scene_images(self, key: CellKey) -> SceneImages | None:
         """The images shared by all methods of the scene; None if there are none."""
         joined = self._read_image(f"{key.scene_stem}.png")
-        return None if joined is None else SceneImages(*(np.ascontiguousarray(p) for p in np.split(joined, 3, 1)))
+        return (
+            None
+            if joined is None
+            else SceneImages(*(np.ascontiguousarray(p) for p in np.split(joined, 3, 1)))
+        )
 
     def _write(self, stem: str, image: Picture | None, features: Features | None) -> None:
         if image is not None:
@@ -154,11 +164,15 @@ class CellStore:
             return None
 
 
-def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
+def cell_keys(
+    scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings
+) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
     rules += [value for value in (settings.background, settings.protocol) if value not in ("black", "strict")]
-    rules += [error_rule(settings.stream.render.error_rule or "holes").__module__]  # has the hash of a user's file
+    rules += [
+        error_rule(settings.stream.render.error_rule or "holes").__module__
+    ]  # has the hash of a user's file
     scene_digest = _digest([*rules, *settings.networks])
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)
@@ -176,7 +190,11 @@ def method_identities(names: tuple[str, ...], settings: RunSettings) -> dict[str
 
 
 def to_cells(
-    scene: LeaveOneOutScene, run: SceneRun, keys: tuple[CellKey, ...], identities: dict[str, str], origin: Provenance
+    scene: LeaveOneOutScene,
+    run: SceneRun,
+    keys: tuple[CellKey, ...],
+    identities: dict[str, str],
+    origin: Provenance,
 ) -> list[Cell]:
     """The cells of a scene's run, in the order of its methods."""
     by_name = {key.method: key for key in keys}

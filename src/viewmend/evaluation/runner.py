@@ -100,7 +100,9 @@ def _check(names: list[str], jobs: int) -> None:
     if jobs < 1:
         raise ValueError(f"expected at least one job, got {jobs}")
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder")
+        raise ValueError(
+            f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder"
+        )
 
 
 def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) -> Runs:

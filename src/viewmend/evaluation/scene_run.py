@@ -96,7 +96,10 @@ class _Frame:
 
 
 def evaluate_scene(
-    scene: LeaveOneOutScene, methods: Sequence[str], settings: RunSettings, loaded: dict[str, Inpainter] | None = None
+    scene: LeaveOneOutScene,
+    methods: Sequence[str],
+    settings: RunSettings,
+    loaded: dict[str, Inpainter] | None = None,
 ) -> SceneRun:
     """Stream the held-out camera's view through the methods, one frame at a time, using past frames only.
 
@@ -156,7 +159,9 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, In
 class _MethodStream:
     """One method's stream through the scene."""
 
-    def __init__(self, method: str, settings: RunSettings, scorers: Scorers, loaded: dict[str, Inpainter]) -> None:
+    def __init__(
+        self, method: str, settings: RunSettings, scorers: Scorers, loaded: dict[str, Inpainter]
+    ) -> None:
         self.method = method
         self._loaded = loaded
         self._settings = settings
@@ -226,9 +231,13 @@ def _check(completed: CompletedView) -> None:
     rgb = completed.rgb
     view = completed.view
     if rgb.shape != view.rgb.shape:
-        raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view")
+        raise ValueError(
+            f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view"
+        )
     if changed := int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum()):
-        raise ValueError(f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E")
+        raise ValueError(
+            f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E"
+        )
 
 
 def _message(error: Exception) -> str:

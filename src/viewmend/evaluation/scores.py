@@ -238,7 +238,11 @@ def _by_origin(
 ) -> dict[str, Any]:
     """PSNR and numbers of the holes by what shows their surface."""
     found: dict[str, Any] = {"only_past_px": int((holes & origins.past).sum())}
-    for name, seen in (("sources", origins.sources), ("others", origins.others), ("past", origins.sources_past)):
+    for name, seen in (
+        ("sources", origins.sources),
+        ("others", origins.others),
+        ("past", origins.sources_past),
+    ):
         found[f"{name}_px"] = int((holes & seen).sum())
         found[f"psnr_{name}"] = psnr(rgb, truth, holes & seen)
     return found

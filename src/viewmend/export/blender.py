@@ -56,11 +56,16 @@ for frame, file in enumerate(sorted((HERE / "hull").glob("*.glb"))):
 
 
 def blender_script(
-    groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int, images: Mapping[str, str]
+    groups: Mapping[str, Cameras],
+    rotation: Float[Tensor, "3 3"],
+    fps: float,
+    frames: int,
+    images: Mapping[str, str],
 ) -> str:
     """A script that opens the exported scene in Blender: cameras with background images, and the animated hull."""
     cameras = [
-        _blender_camera(own[view]) | {"group": group, "image": images.get(own.names[view]), "engine_from_camera": pose}
+        _blender_camera(own[view])
+        | {"group": group, "image": images.get(own.names[view]), "engine_from_camera": pose}
         for group, own in groups.items()
         for view, pose in enumerate(engine_from_cameras(own, rotation).tolist())
     ]

@@ -71,7 +71,12 @@ def _gltf(parts: Mapping[str, tuple[np.ndarray, str, int]]) -> dict[str, object]
     for name, (array, kind, component) in parts.items():
         target = ELEMENT_ARRAY_BUFFER if name == "indices" else ARRAY_BUFFER
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
-        accessor = {"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind}
+        accessor = {
+            "bufferView": len(views) - 1,
+            "componentType": component,
+            "count": len(array),
+            "type": kind,
+        }
         if name == "COLOR_0":
             accessor["normalized"] = True
         accessors.append(accessor)
@@ -114,7 +119,9 @@ def write_ply(
     points["position"] = vertices.cpu().numpy()
     points["colour"] = np.rint(255 * colours.clamp(0, 1).cpu().numpy())
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    lines += [f"property float {axis}" for axis in "xyz"] + [
+        f"property uchar {c}" for c in ("red", "green", "blue")
+    ]
     triangles = np.zeros(0 if faces is None else len(faces), [("corners", "u1"), ("vertex", "<i4", 3)])
     if faces is not None:
         triangles["corners"] = 3

@@ -117,7 +117,9 @@ def check_onnx() -> None:
     """ValueError without the packages that write ONNX."""
     absent = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
     if absent:
-        raise ValueError(f"expected {' and '.join(absent)} for --format onnx, got none; pip install 'viewmend[all]'")
+        raise ValueError(
+            f"expected {' and '.join(absent)} for --format onnx, got none; pip install 'viewmend[all]'"
+        )
 
 
 def write_pt2(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -> None:

@@ -113,7 +113,9 @@ def _export_view(
     return extract_points(view.completed, frame, min_confidence)
 
 
-def extract_points(completed: CompletedView, frame: MultiViewFrame, min_confidence: float) -> Float[Tensor, "point 6"]:
+def extract_points(
+    completed: CompletedView, frame: MultiViewFrame, min_confidence: float
+) -> Float[Tensor, "point 6"]:
     """World positions, metres, and RGB in [0, 1] of pixels that show the subject, on the CPU.
 
     Such a pixel has depth, an opacity above a half and at least this confidence; at least two cameras have its point in
@@ -126,7 +128,9 @@ def extract_points(completed: CompletedView, frame: MultiViewFrame, min_confiden
     height, width = depth.shape
     uv = pixel_centers(width, height, depth.device)[kept]
     world = unproject(uv[None], depth[kept][None], completed.view.camera)[0]
-    return torch.cat([world, completed.straight_rgb[:, kept].mT], 1)[_within_masks(world, frame)].float().cpu()
+    return (
+        torch.cat([world, completed.straight_rgb[:, kept].mT], 1)[_within_masks(world, frame)].float().cpu()
+    )
 
 
 def check_openexr() -> None:

@@ -21,7 +21,14 @@ from viewmend.models.base import ContextProvider
 from viewmend.models.smooth_fill import from_near, spread
 from viewmend.models.views.grid import scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.pyramids import AREA_LEVEL, SMALLEST_PX, MipLevels, SceneScale, SourceCameras, choose_levels
+from viewmend.models.views.pyramids import (
+    AREA_LEVEL,
+    SMALLEST_PX,
+    MipLevels,
+    SceneScale,
+    SourceCameras,
+    choose_levels,
+)
 from viewmend.models.views.ray_fill import gather_ray_inputs
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
@@ -157,7 +164,9 @@ class ExportedModel(nn.Module):
         fill = None if self.net.coarse is None else guess
         completed = prediction.composite_into(view, where, torch.zeros_like(where), fill, keep_remains=True)
         assert completed.confidence is not None, "the model predicts it"
-        return tuple(ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth))
+        return tuple(
+            ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth)
+        )
 
     def _guess(self, view: IncompleteView, sources: "PackedSources") -> Float[Tensor, "3 height width"]:
         """`ViewSynthNet.coarse_guess`."""
@@ -196,7 +205,9 @@ class PackedSources(SourceCameras):
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
         """`SourceCameras.mips`."""
         images = PackedPyramids.of(self.images.float(), self.cameras.size_px, mask=3)
-        masks = PackedPyramids.of(self.silhouettes.mask[:, None].float(), self.silhouettes.cameras.size_px, mask=0)
+        masks = PackedPyramids.of(
+            self.silhouettes.mask[:, None].float(), self.silhouettes.cameras.size_px, mask=0
+        )
         mips: list[MipLevels] = []
         for packed, cameras in ((images, self.cameras), (masks, self.silhouettes.cameras)):
             levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
@@ -222,7 +233,10 @@ class PackedPyramids(NamedTuple):
 
     @classmethod
     def of(
-        cls, images: Float[Tensor, "camera channel rows columns"], sizes_px: Int[Tensor, "camera 2"], mask: int
+        cls,
+        images: Float[Tensor, "camera channel rows columns"],
+        sizes_px: Int[Tensor, "camera 2"],
+        mask: int,
     ) -> "PackedPyramids":
         """The pyramids of images of 0 to 255; `mask` is the mask's channel."""
         levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor(), CONSTANT)
@@ -235,7 +249,9 @@ class PackedPyramids(NamedTuple):
     def at(self, level: Int[Tensor, "camera"]) -> MipLevels:
         """One level of each camera."""
         first = self.first[level] + torch.arange(level.shape[0]) * self.pixels.shape[1]
-        return MipLevels(self.pixels.flatten(0, 1), first, self.columns[level], self.size[level], 0.5 ** level.double())
+        return MipLevels(
+            self.pixels.flatten(0, 1), first, self.columns[level], self.size[level], 0.5 ** level.double()
+        )
 
 
 def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -274,7 +290,10 @@ def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def halvings(
-    images: Float[Tensor, "image channel height width"], count: int, change: Callable[[Tensor], Tensor], constant: int
+    images: Float[Tensor, "image channel height width"],
+    count: int,
+    change: Callable[[Tensor], Tensor],
+    constant: int,
 ) -> list[Float[Tensor, "image channel _height _width"]]:
     """Some images at full resolution and at `count` halved ones, each in a canvas.
 

@@ -14,7 +14,13 @@ from viewmend.geometry.cameras import Cameras
 def usd_scene(groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int) -> str:
     """Cameras as ASCII USD (.usda), metres, y up; skew is left out."""
     lines = ["#usda 1.0", "(", '    defaultPrim = "scene"', "    metersPerUnit = 1", '    upAxis = "Y"']
-    lines += [f"    timeCodesPerSecond = {fps:g}", "    startTimeCode = 0", f"    endTimeCode = {frames - 1}", ")", ""]
+    lines += [
+        f"    timeCodesPerSecond = {fps:g}",
+        "    startTimeCode = 0",
+        f"    endTimeCode = {frames - 1}",
+        ")",
+        "",
+    ]
     lines += ['def Xform "scene"', "{"]
     for group, cameras in groups.items():
         lines += [f'    def Scope "{group}"', "    {"]

@@ -160,14 +160,18 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
                 elif verdict == MIXED:
                     mixed[undecided] = view
                     undecided += 1
-            box = values[first:end_x, first_y : min(first_y + block, end_y), first_z : min(first_z + block, end_z)]
+            box = values[
+                first:end_x, first_y : min(first_y + block, end_y), first_z : min(first_z + block, end_z)
+            ]
             if seen < 0 or seen + undecided < needed:
                 box[:] = 0
             elif undecided == 0:
                 box[:] = 1
             else:
                 corner = (low[0] + first * voxel_m, low[1] + first_y * voxel_m, low[2] + first_z * voxel_m)
-                carve_voxels(P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch)
+                carve_voxels(
+                    P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch
+                )
 
 
 @kernel
@@ -216,7 +220,9 @@ def locate(P, origin, voxel_m, size, pool, count, scratch):
     step = np.empty((3, 3), np.float32)
     for row in range(3):
         scale = 1.0 if row == 2 else 1.0 / pool
-        base[row] = scale * (P[row, 0] * origin[0] + P[row, 1] * origin[1] + P[row, 2] * origin[2] + P[row, 3])
+        base[row] = scale * (
+            P[row, 0] * origin[0] + P[row, 1] * origin[1] + P[row, 2] * origin[2] + P[row, 3]
+        )
         for axis in range(3):
             step[row, axis] = scale * voxel_m * P[row, axis]
     u0 = base[0]

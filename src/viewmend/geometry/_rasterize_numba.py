@@ -104,7 +104,9 @@ def interpolate_band(attributes, vertices, faces, P, triangle, first_row, end_ro
             wc = ax * by - ay * bx
             scale = 1 / (wa + wb + wc)
             for channel in range(image.shape[2]):
-                value = wa * attributes[a, channel] + wb * attributes[b, channel] + wc * attributes[c, channel]
+                value = (
+                    wa * attributes[a, channel] + wb * attributes[b, channel] + wc * attributes[c, channel]
+                )
                 image[row, column, channel] = value * scale
 
 

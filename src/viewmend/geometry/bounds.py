@@ -42,4 +42,6 @@ class Bounds(OnDevice):
     @property
     def corners(self) -> Float[Tensor, "8 3"]:
         """All eight corners."""
-        return torch.cartesian_prod(*[torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)])
+        return torch.cartesian_prod(
+            *[torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)]
+        )

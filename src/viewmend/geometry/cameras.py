@@ -52,7 +52,9 @@ class Cameras(OnDevice):
         else:
             index = views
         names = tuple(self.names[view] for view in index)
-        made = Cameras(names, *(_rows(field, index) for field in (self.K, self.camera_from_world, self.size_px)))
+        made = Cameras(
+            names, *(_rows(field, index) for field in (self.K, self.camera_from_world, self.size_px))
+        )
         return self._with_host(made, lambda host: host[views])
 
     def _with_host(self, made: "Cameras", change: "Callable[[Cameras], Cameras]") -> "Cameras":
@@ -68,7 +70,9 @@ class Cameras(OnDevice):
             raise ValueError("expected at least one camera, got none; name the cameras")
         twice = sorted({name for name in self.names if self.names.count(name) > 1})
         if twice:
-            raise ValueError(f"expected a different name for each camera, got several cameras {twice}; rename them")
+            raise ValueError(
+                f"expected a different name for each camera, got several cameras {twice}; rename them"
+            )
         check_tensor(
             "K",
             self.K,
@@ -111,7 +115,9 @@ class Cameras(OnDevice):
         """ValueError unless this is one camera that passes `check`."""
         self.check()
         if len(self) != 1:
-            raise ValueError(f"expected the camera of one view, got {len(self)}; choose one, as in cameras[0]")
+            raise ValueError(
+                f"expected the camera of one view, got {len(self)}; choose one, as in cameras[0]"
+            )
 
     def select(self, names: Sequence[str]) -> "Cameras":
         """The cameras of these names, in this order.
@@ -234,7 +240,9 @@ def unproject(
     return torch.einsum("vij,vpj->vpi", world[:, :3, :3], rays * z_m[..., None]) + world[:, None, :3, 3]
 
 
-def pixel_centers(width: int, height: int, device: torch.device | str = "cpu") -> Float[Tensor, "height width 2"]:
+def pixel_centers(
+    width: int, height: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "height width 2"]:
     """Image coordinates of every pixel's centre: (0.5, 0.5) at the top left."""
     u = torch.arange(width, device=device, dtype=torch.float32) + 0.5
     v = torch.arange(height, device=device, dtype=torch.float32) + 0.5

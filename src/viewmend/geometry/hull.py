@@ -100,7 +100,9 @@ class OccupancyGrid:
         parts = [blocks.flatten(), _lines(self.values > ISO), _lines(self.values > FAINT)]
         blocks_read, inside, filled = torch.cat(parts).cpu().split([blocks.numel(), lines, lines])
         shape = self.values.shape
-        return GridSummary(blocks_read.view(blocks.shape), _box_of_lines(inside, shape), _box_of_lines(filled, shape))
+        return GridSummary(
+            blocks_read.view(blocks.shape), _box_of_lines(inside, shape), _box_of_lines(filled, shape)
+        )
 
     @property
     def cubes(self) -> "Cubes":
@@ -166,7 +168,9 @@ def occupied_bounds(
     if _has_kernels(mask):
         if not bool(mask.any()):
             return None
-        find = partial(_occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras)
+        find = partial(
+            _occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras
+        )
     else:
         find = partial(occupied_blocks, count_tiles(mask, tile), tile, cameras)
     box = bounds.on_host
@@ -275,7 +279,9 @@ def _carve_cpu(
     return values
 
 
-def _count_tiles(images: np.ndarray, height: int, width: int, tile: int) -> Int[np.ndarray, "view row column 2"]:
+def _count_tiles(
+    images: np.ndarray, height: int, width: int, tile: int
+) -> Int[np.ndarray, "view row column 2"]:
     """Summed-area tables of the first rows and columns of each image."""
     from viewmend.geometry._hull_numba import count_tiles
 
@@ -300,7 +306,9 @@ def _occupied_cpu(
 def check_views(cameras: Cameras) -> None:
     """Raise ValueError if there are too few cameras to carve a hull."""
     if len(cameras) < 2:
-        raise ValueError(f"expected masks of at least two cameras, got {len(cameras)}; a hull needs several views")
+        raise ValueError(
+            f"expected masks of at least two cameras, got {len(cameras)}; a hull needs several views"
+        )
 
 
 def bounds_from_cameras(cameras: Cameras) -> Bounds:
@@ -354,7 +362,10 @@ def _mask_boxes(mask: UInt8[Tensor, "view height width"]) -> list[tuple[int, int
 
 
 def _cube_around(
-    cameras: Cameras, directions: Float[Tensor, "view 3"], half_at_1: Float[Tensor, "view"], largest: bool = False
+    cameras: Cameras,
+    directions: Float[Tensor, "view 3"],
+    half_at_1: Float[Tensor, "view"],
+    largest: bool = False,
 ) -> Bounds:
     """The cube about the point nearest to all rays; half its side is `half_at_1` times the distance from there."""
     centers = cameras.centers
@@ -462,4 +473,6 @@ def _foreground_tiles(
     right = to_tile[..., 0].clamp(max=columns - 2) + 1
     bottom = to_tile[..., 1].clamp(max=rows - 2) + 1
     view = torch.arange(len(sums), device=sums.device)[:, None]
-    return sums[view, bottom, right] - sums[view, top, right] - sums[view, bottom, left] + sums[view, top, left]
+    return (
+        sums[view, bottom, right] - sums[view, top, right] - sums[view, bottom, left] + sums[view, top, left]
+    )

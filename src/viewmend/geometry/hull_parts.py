@@ -119,7 +119,9 @@ class _Cells:
     """The cells of each part, and those with their neighbours."""
 
     @classmethod
-    def of(cls, part: Int[np.ndarray, "point"], y: Int[np.ndarray, "point"], x: Int[np.ndarray, "point"]) -> "_Cells":
+    def of(
+        cls, part: Int[np.ndarray, "point"], y: Int[np.ndarray, "point"], x: Int[np.ndarray, "point"]
+    ) -> "_Cells":
         width = int(x.max()) + 2
         height = int(y.max()) + 2
         place = y * width + x

@@ -151,10 +151,15 @@ def fit_to(path: Cameras, points: Float[Tensor, "point 3"]) -> Cameras:
     return replace(cameras, K=K)
 
 
-def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int, arc_rad: float | None = None) -> list[float]:
+def _swing(
+    azimuths: Sequence[float], views: int, frames_per_turn: int, arc_rad: float | None = None
+) -> list[float]:
     """Azimuths of a path over the rig's own, beginning in the middle of its widest gap's far end."""
     ordered = sorted(a % (2 * math.pi) for a in azimuths)
-    gaps = [(after - before) % (2 * math.pi) for before, after in zip(ordered, [*ordered[1:], ordered[0]], strict=True)]
+    gaps = [
+        (after - before) % (2 * math.pi)
+        for before, after in zip(ordered, [*ordered[1:], ordered[0]], strict=True)
+    ]
     widest = max(range(len(gaps)), key=lambda n: gaps[n])
     start = ordered[(widest + 1) % len(ordered)]
     phases = [view / frames_per_turn for view in range(views)]

@@ -96,7 +96,9 @@ def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
     if sides is None:
         return None
     first = torch.tensor([max(side.start - 1, 0) for side in sides])
-    end = torch.tensor([min(side.stop + 1, size) for side, size in zip(sides, grid.values.shape, strict=True)])
+    end = torch.tensor(
+        [min(side.stop + 1, size) for side, size in zip(sides, grid.values.shape, strict=True)]
+    )
     low = grid.low + (first - 1) * grid.voxel_m
     high = grid.low + (end + 1) * grid.voxel_m
     return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))

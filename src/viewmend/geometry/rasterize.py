@@ -69,7 +69,9 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
         columns, rows = size[view]
         first = rows * band // bands
         end = rows * (band + 1) // bands
-        kernels.draw_band(projected[view], faces, NEAR_M, side, first, end, columns, depths[view], triangles[view])
+        kernels.draw_band(
+            projected[view], faces, NEAR_M, side, first, end, columns, depths[view], triangles[view]
+        )
 
     parallel_for(lambda view: kernels.project_vertices(vertices, P[view], projected[view]), views)
     parallel_for(draw, views * bands)
@@ -123,7 +125,9 @@ def homogeneous(vertices: Float[Tensor, "vertex 3"], cameras: Cameras) -> Float[
     return torch.einsum("vij,nj->vni", P[:, :, :3], vertices.double()) + P[:, None, :, 3]
 
 
-def edge_functions(corners: Float[Tensor, "*batch 3 3"]) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
+def edge_functions(
+    corners: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
     """Edge i as the plane q_j x q_k over (u, v, 1), and the triangle's determinant; corner by corner in dim -2."""
     a, b, c = corners.unbind(-2)
     edges = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
@@ -143,7 +147,9 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
 
     # every triangle of every view has a box of pixels, of which the device tells only the total number at first
-    view = torch.arange(len(cameras), device=device).repeat_interleave(len(mesh.faces), output_size=keep.numel())
+    view = torch.arange(len(cameras), device=device).repeat_interleave(
+        len(mesh.faces), output_size=keep.numel()
+    )
     face = torch.arange(len(mesh.faces), device=device).repeat(len(cameras))
     extent = torch.where(keep[..., None], high - low + 1, 0).flatten(0, 1)
     low = low.flatten(0, 1)
@@ -214,7 +220,9 @@ def _candidate_pixels(
 
 
 def _inverse_depth(
-    edges: Float[Tensor, "candidate 3 3"], determinant: Float[Tensor, "candidate"], uv: Int[Tensor, "candidate 2"]
+    edges: Float[Tensor, "candidate 3 3"],
+    determinant: Float[Tensor, "candidate"],
+    uv: Int[Tensor, "candidate 2"],
 ) -> Float[Tensor, "candidate"]:
     """1/z of the triangle at each pixel's centre, float32; -1 where the centre is outside it or z <= near."""
     u, v = (uv.double() + 0.5).unsqueeze(1).unbind(-1)

@@ -56,7 +56,9 @@ def sample_bilinear(
     """Images at pixel positions, each at its own. What lies outside is 0, or the nearest pixel of the border."""
     height, width = images.shape[2:]
     grid = 2 * _clamped(uv_px, width, height) / uv_px.new_tensor([width, height]) - 1
-    return F.grid_sample(images, grid[:, None], padding_mode=padding, align_corners=False)[:, :, 0].movedim(1, -1)
+    return F.grid_sample(images, grid[:, None], padding_mode=padding, align_corners=False)[:, :, 0].movedim(
+        1, -1
+    )
 
 
 def _clamped(uv_px: Float[Tensor, "*point 2"], width: int, height: int) -> Float[Tensor, "*point 2"]:

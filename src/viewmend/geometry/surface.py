@@ -60,13 +60,19 @@ def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3
     changes = torch.zeros(3, *values.shape, dtype=torch.bool, device=values.device)
     for axis in range(3):
         steps = values.shape[axis] - 1
-        torch.ne(inside.narrow(axis, 0, steps), inside.narrow(axis, 1, steps), out=changes[axis].narrow(axis, 0, steps))
+        torch.ne(
+            inside.narrow(axis, 0, steps),
+            inside.narrow(axis, 1, steps),
+            out=changes[axis].narrow(axis, 0, steps),
+        )
     edges = changes.nonzero()
     vertex_of_edge = torch.full((3 * inside.numel(),), -1, dtype=torch.int32, device=values.device)
     axis, x, y, z = edges.unbind(1)
     size_y, size_z = values.shape[1:]
     cell = (x * size_y + y) * size_z + z
-    vertex_of_edge[axis * inside.numel() + cell] = torch.arange(len(edges), dtype=torch.int32, device=values.device)
+    vertex_of_edge[axis * inside.numel() + cell] = torch.arange(
+        len(edges), dtype=torch.int32, device=values.device
+    )
 
     # how far along the edge
     stride = torch.where(axis == 0, size_y * size_z, torch.where(axis == 1, size_z, 1))

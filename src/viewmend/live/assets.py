@@ -142,7 +142,9 @@ class AssetStore:
             if len(self._making) >= MAX_MAKING:
                 raise BusyError("too many frames are being prepared; try again")
             task = self._making[key] = asyncio.create_task(self._prepare(key, version))
-            task.add_done_callback(lambda done: done.cancelled() or done.exception())  # its waiters may have left
+            task.add_done_callback(
+                lambda done: done.cancelled() or done.exception()
+            )  # its waiters may have left
         return await asyncio.shield(task)
 
     async def _prepare(self, key: Key, version: str) -> FrameAssets:
@@ -161,7 +163,9 @@ class AssetStore:
                 self._making.pop(key, None)
 
 
-async def wait_for_frame(read: Callable[[int], MultiViewFrame | None], index: int, limit_s: float) -> MultiViewFrame:
+async def wait_for_frame(
+    read: Callable[[int], MultiViewFrame | None], index: int, limit_s: float
+) -> MultiViewFrame:
     """A frame once it is in memory; TimeoutError if it is not read in time."""
     end = time.monotonic() + limit_s
     while (frame := read(index)) is None:
@@ -207,7 +211,9 @@ def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfi
     return FrameAssets(shape, tuple(images))
 
 
-def _shape_arrays(frame: MultiViewFrame, proxy: GeometryProxy) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+def _shape_arrays(
+    frame: MultiViewFrame, proxy: GeometryProxy
+) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
     """Integer arrays of the shape by name, each with more fields of its description."""
     vertices = proxy.mesh.vertices.cpu().double().numpy()
     low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else (np.zeros(3), np.zeros(3))

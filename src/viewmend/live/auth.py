@@ -48,9 +48,16 @@ class AccessControl:
         self._public: str | None = None
         if public_url is not None:
             url = urlsplit(public_url)
-            if url.scheme not in ("http", "https") or not _parse_host(url.netloc, 80) or url.query or url.fragment:
+            if (
+                url.scheme not in ("http", "https")
+                or not _parse_host(url.netloc, 80)
+                or url.query
+                or url.fragment
+            ):
                 next_step = "write the proxy's address"
-                raise ValueError(f"expected --public-url https://NAME/PATH, got '{public_url[:80]}'; {next_step}")
+                raise ValueError(
+                    f"expected --public-url https://NAME/PATH, got '{public_url[:80]}'; {next_step}"
+                )
             self._public = f"{url.scheme}://{url.netloc}".lower()
         # Without a token, a page whose name resolves to this machine could read what it shows.
         self._any_host = bool(token) or not is_loopback(host)
@@ -70,7 +77,9 @@ class AccessControl:
         origin = connection.headers.get("origin")
         if origin is not None and not (_is_same_origin(origin, host) or origin.lower() == self._public):
             next_step = "open the printed address, or start the server with --public-url"
-            return f"expected a request from this server's own page, got the origin '{origin[:60]}'; {next_step}"
+            return (
+                f"expected a request from this server's own page, got the origin '{origin[:60]}'; {next_step}"
+            )
         site = connection.headers.get("sec-fetch-site", "none")
         is_link = connection.headers.get("sec-fetch-dest") == "document"
         if site not in ("none", "same-origin") and not is_link:

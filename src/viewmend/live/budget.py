@@ -117,7 +117,9 @@ class Budget:
     def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = CONTEXT_LADDER.levels) -> None:
         """Start in the middle of the ladder; ValueError if the target is not positive, or there are no levels."""
         if not target_ms > 0 or not levels:
-            raise ValueError(f"expected a positive budget and levels, got {target_ms} ms and {len(levels)} levels")
+            raise ValueError(
+                f"expected a positive budget and levels, got {target_ms} ms and {len(levels)} levels"
+            )
         self.budget_ms = self.target_ms = target_ms
         """The time of a view if there are no other viewers; the target is lower if there are."""
         self.levels = tuple(levels)
@@ -159,8 +161,14 @@ class Budget:
         if self.predict_ms(self.level) > self.target_ms and self.index > 0:
             if self._frames_since_up < PROBATION_FRAMES:
                 self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
-            good = [n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms]
-            self.index, self._frames_with_room, self._frames_since_up = max(good, default=0), 0, PROBATION_FRAMES
+            good = [
+                n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms
+            ]
+            self.index, self._frames_with_room, self._frames_since_up = (
+                max(good, default=0),
+                0,
+                PROBATION_FRAMES,
+            )
         elif self.index + 1 < len(self.levels):
             fits = self.predict_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
             self._frames_with_room = self._frames_with_room + 1 if fits else 0

@@ -43,11 +43,16 @@ class ServerSocket:
         try:
             self._socket = self._context.enter_context(connect(address, max_size=None, compression=None))
         except InvalidStatus as refused:
-            reason, status = bytes(refused.response.body or b"").decode(errors="replace"), refused.response.status_code
+            reason, status = (
+                bytes(refused.response.body or b"").decode(errors="replace"),
+                refused.response.status_code,
+            )
             kind = ConnectionLostError if status >= 500 else ConnectionError
             raise kind(f"the server refuses ({status}): {reason[:400]}") from None
         except (OSError, InvalidHandshake, ConnectionClosed) as error:
-            raise ConnectionLostError(f"{url}: expected a server, got none ({error}); is it running?") from None
+            raise ConnectionLostError(
+                f"{url}: expected a server, got none ({error}); is it running?"
+            ) from None
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` raises the reason."""
@@ -300,7 +305,9 @@ class Publisher(Connection):
         for view, name in enumerate(frame.cameras.names):
             width, height = frame.cameras.size_px[view].tolist()
             rgb = frame.rgb[view, :, :height, :width].movedim(0, -1).cpu().numpy()
-            jpeg = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+            jpeg = cv2.imencode(
+                ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+            )[1]
             mask = frame.mask[view, :height, :width].cpu().numpy()
             png = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             for kind, data in (("rgb", jpeg.tobytes()), ("mask", png.tobytes())):

@@ -96,7 +96,9 @@ class ViewerConnection:
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._sent = SentMessages()
         ladder = registry.service.renderer.ladder
-        self._session = ViewerSession(self._send_frame, self._report_error, registry.budget_ms, ladder, self._now)
+        self._session = ViewerSession(
+            self._send_frame, self._report_error, registry.budget_ms, ladder, self._now
+        )
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""
@@ -135,7 +137,9 @@ class ViewerConnection:
         if not isinstance(hello, Hello):
             raise ClosingError(4400, "expected 'hello' as the first message; see docs/live-protocol.md")
         if hello.version != protocol.VERSION:
-            raise ClosingError(4426, f"expected version {protocol.VERSION}, got {hello.version}; reload the page")
+            raise ClosingError(
+                4426, f"expected version {protocol.VERSION}, got {hello.version}; reload the page"
+            )
         about = self._registry.about
         welcome = about | {
             "type": "welcome",
@@ -321,4 +325,6 @@ class ViewerConnection:
 
     def _report_error(self, message: str) -> None:
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._send_soon, protocol.error_json("render", message, fatal=False))
+            self._loop.call_soon_threadsafe(
+                self._send_soon, protocol.error_json("render", message, fatal=False)
+            )

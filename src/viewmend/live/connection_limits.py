@@ -111,7 +111,9 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         """Requests that are being answered: 0 or 1."""
         self.since_s = self.idle_since_s = self._read_at_s = limits.now()
         self._limits = limits
-        self._uvicorn: asyncio.BaseProtocol = H11Protocol(config, server_state, app_state | {STATE_KEY: self}, _loop)
+        self._uvicorn: asyncio.BaseProtocol = H11Protocol(
+            config, server_state, app_state | {STATE_KEY: self}, _loop
+        )
         self._is_websocket = False
         self.message_bytes = self._max_message_bytes = 0
         """Bytes that have been read since the application received the last message, and their limit."""
@@ -192,11 +194,17 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         if self._held and not is_held_back:
             if self.authenticated:
                 self._deliver(len(self._held))
-            elif not self._is_websocket and not self._is_waiting:  # a WebSocket is read once it is authenticated
+            elif (
+                not self._is_websocket and not self._is_waiting
+            ):  # a WebSocket is read once it is authenticated
                 self._is_waiting = True
                 self._limits.scheduler.submit(self._take_turn, self._turns == 0)
         if not self.is_closing():
-            (self._transport.pause_reading if self._held or self._input_paused else self._transport.resume_reading)()
+            (
+                self._transport.pause_reading
+                if self._held or self._input_paused
+                else self._transport.resume_reading
+            )()
 
     def _take_turn(self) -> None:
         self._is_waiting = False

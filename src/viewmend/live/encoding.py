@@ -52,7 +52,9 @@ def draw_mode(
     if mode == "depth":
         opacity = (completed.view.cut_depth > 0).float()
     else:
-        opacity = completed.opacity if mode in COMPLETED_MODES else completed.view.mask if own is None else own[3]
+        opacity = (
+            completed.opacity if mode in COMPLETED_MODES else completed.view.mask if own is None else own[3]
+        )
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
     return cv2.add(image, cv2.merge(channels))
@@ -66,7 +68,9 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
         grey = completed.rgb.mean(0).expand(3, -1, -1)
         if completed.confidence is None:
             return _to_8bit(grey)
-        heat = torch.from_numpy(heat_map(completed.confidence, "viridis")).movedim(-1, 0).to(completed.rgb) / 255
+        heat = (
+            torch.from_numpy(heat_map(completed.confidence, "viridis")).movedim(-1, 0).to(completed.rgb) / 255
+        )
         return _to_8bit(torch.where(view.refine_mask, heat * completed.opacity, grey))
     if mode == "depth":
         depth = view.cut_depth
@@ -158,7 +162,9 @@ def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth
     near, far = (float(z[surface].min()), float(z[surface].max())) if surface.any() else (1.0, 2.0)
     far = max(far, near * 1.001)
     inverse = 1 / np.where(surface, z, near)
-    q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(np.uint16)
+    q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(
+        np.uint16
+    )
     deltas = np.diff(q, axis=1, prepend=np.uint16(0))
     return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), stride, near, far)
 
@@ -193,7 +199,12 @@ class Encoders:
 
 @light_operations()
 def encode_frame(
-    look: Look, request: RenderRequest, result: RenderResult, encoders: Encoders, wait_ms: float, **fields: Any
+    look: Look,
+    request: RenderRequest,
+    result: RenderResult,
+    encoders: Encoders,
+    wait_ms: float,
+    **fields: Any,
 ) -> tuple[bytes, FrameTimes]:
     """Build the message of a frame, with more `fields` in its header; returns it with the times of all stages."""
     start = time.perf_counter()
@@ -206,11 +217,17 @@ def encode_frame(
             parts.append(part)
             data.append(encoded)
         if look.depth:
-            depth = surface_depth(completed) if COMPLETED_MODES.issuperset(look.modes) else completed.view.depth
-            stride = next((stride for longest, stride in DEPTH_STRIDES if max(depth.shape) <= longest), COARSEST_STRIDE)
+            depth = (
+                surface_depth(completed) if COMPLETED_MODES.issuperset(look.modes) else completed.view.depth
+            )
+            stride = next(
+                (stride for longest, stride in DEPTH_STRIDES if max(depth.shape) <= longest), COARSEST_STRIDE
+            )
             packed = asdict(pack_depth(depth, stride))
             data.append(packed.pop("data"))
-            parts.append({"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed})
+            parts.append(
+                {"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed}
+            )
     encode_ms = 1000 * (time.perf_counter() - start)
     times = FrameTimes(**vars(result.times), encode=encode_ms, wait=wait_ms)
     first = result.completed[0].view
@@ -220,7 +237,9 @@ def encode_frame(
         "time": result.time,
         "width": first.mask.shape[1],
         "height": first.mask.shape[0],
-        "cameras": [{k: c[k] for k in ("K", "R", "T")} for v in result.completed for c in cameras_json(v.view.camera)],
+        "cameras": [
+            {k: c[k] for k in ("K", "R", "T")} for v in result.completed for c in cameras_json(v.view.camera)
+        ],
         "source_views": list(first.source_views),
         "input_views": list(result.input_views or first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],

@@ -248,7 +248,9 @@ class RecordedSource(FrameSource):
                 if capture is None:
                     capture = self._open()
                 self._step(capture)
-            except Exception as error:  # reported, in the log unless it is the same as before, and tried again
+            except (
+                Exception
+            ) as error:  # reported, in the log unless it is the same as before, and tried again
                 reason = f"{type(error).__name__}: {error}"[:400]
                 if self.status.error != reason:
                     log.warning("while reading: %s", reason)
@@ -284,5 +286,8 @@ class RecordedSource(FrameSource):
         total = self.span.total or 0
         if self._generated and self.span.end < total:
             return self.span.end
-        ahead = [(self._wanted + n) % max(1, total) for n in range(min(READ_AHEAD + 1, total, self._cache.capacity))]
+        ahead = [
+            (self._wanted + n) % max(1, total)
+            for n in range(min(READ_AHEAD + 1, total, self._cache.capacity))
+        ]
         return next((index for index in ahead if index not in self._cache), None)

@@ -61,7 +61,9 @@ class Server:
                 listener.listen(64)  # clients may connect as soon as the address is printed
             except OSError as error:
                 reason = error.strerror or str(error)
-                raise OSError(f"port {self._port} of {self._host}: {reason}; choose another --port or --host") from None
+                raise OSError(
+                    f"port {self._port} of {self._host}: {reason}; choose another --port or --host"
+                ) from None
             self._socket = listener
             name = f"[{self._host}]" if ":" in self._host else self._host
             yield f"http://{name}:{listener.getsockname()[1]}"

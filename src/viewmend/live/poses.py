@@ -39,7 +39,12 @@ class HomeView:
     def as_json(self) -> dict[str, Any]:
         """Its part of the message `rig`."""
         axes = {key: _list(getattr(self, key)) for key in ("center", "up", "front", "side")}
-        names = {"azimuth": self.azimuth, "elevation": self.elevation, "distance": self.distance_m, "fov_y": self.fov_y}
+        names = {
+            "azimuth": self.azimuth,
+            "elevation": self.elevation,
+            "distance": self.distance_m,
+            "fov_y": self.fov_y,
+        }
         return axes | {"home": {name: round(value, 4) for name, value in names.items()}}
 
 
@@ -61,14 +66,18 @@ def home_view(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     gaps = torch.cat([after, after.new_tensor([360.0])]).diff()
     widest, others = int(gaps.argmax()), gaps.sort().values[:-1]
     if not len(others) or float(gaps[widest]) >= ARC_GAP * float(others[-1]):
-        ahead = float(after[widest] + gaps[widest] / 2) + 180  # opposite to the widest gap, relative to camera 0
+        ahead = (
+            float(after[widest] + gaps[widest] / 2) + 180
+        )  # opposite to the widest gap, relative to camera 0
     else:
         ahead = float(after[after > 1][0]) / 2
     elevation = float(torch.rad2deg(torch.asin((offsets @ up / distance).clamp(-1, 1))).mean())
     width, height = cameras.size_px[0].tolist()
     fov_y = 2 * math.degrees(math.atan(min(width, height) / 2 / float(cameras.K[0, 1, 1])))
     azimuth = round((float(azimuths[0]) + ahead + 180) % 360 - 180, 2)
-    return HomeView(center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y)
+    return HomeView(
+        center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y
+    )
 
 
 def view_camera(asked: Camera, home: HomeView, size_px: tuple[int, int], scale: float = 1.0) -> Cameras:

@@ -37,7 +37,9 @@ Count = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
 ClientMs = Annotated[float, Meta(ge=-1e15, le=1e15)]
 Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
-Rotation = Annotated[tuple[Annotated[float, Meta(ge=-1.001, le=1.001)], ...], Meta(min_length=9, max_length=9)]
+Rotation = Annotated[
+    tuple[Annotated[float, Meta(ge=-1.001, le=1.001)], ...], Meta(min_length=9, max_length=9)
+]
 """camera_from_world, row by row."""
 Degrees = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Elevation = Annotated[float, Meta(ge=-89.9, le=89.9)]
@@ -76,10 +78,14 @@ class Limits:
         """Raise a ProtocolError if a side, or all views together, have too many pixels."""
         size = f"{width} x {height}"
         if max(width, height) > self.max_side_px:
-            raise ProtocolError(f"expected sides from 16 to {self.max_side_px} pixels, got {size}; request less")
+            raise ProtocolError(
+                f"expected sides from 16 to {self.max_side_px} pixels, got {size}; request less"
+            )
         if width * height * views > self.max_pixels:
             size = size if views == 1 else f"{views} times {size}"
-            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {size}; request smaller images")
+            raise ProtocolError(
+                f"expected at most {self.max_pixels} pixels, got {size}; request smaller images"
+            )
 
 
 class Camera(Struct, frozen=True, kw_only=True):
@@ -138,7 +144,9 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
 
     def __post_init__(self) -> None:
         if "compared" in self.modes and self.model is None:
-            raise ProtocolError("expected 'model' for the mode 'compared', got none; `welcome` lists the models")
+            raise ProtocolError(
+                "expected 'model' for the mode 'compared', got none; `welcome` lists the models"
+            )
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))
 
     @property
@@ -248,7 +256,9 @@ def error_json(code: int | str, message: str, fatal: bool) -> dict[str, Any]:
 def check_rotation(R: Sequence[float]) -> None:
     """Raise a ProtocolError if nine numbers, row by row, are not a rotation matrix."""
     if not bool(is_rotation(torch.tensor(R, dtype=torch.float64).view(3, 3))):
-        raise ProtocolError("expected 'R' as a rotation, world to camera, row by row, got another matrix; check signs")
+        raise ProtocolError(
+            "expected 'R' as a rotation, world to camera, row by row, got another matrix; check signs"
+        )
 
 
 def pack(header: dict[str, Any], parts: Sequence[bytes]) -> bytes:
@@ -261,7 +271,9 @@ class _Part(Struct, frozen=True):
     bytes: Count
 
 
-def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tuple[dict[str, Any], list[bytes]]:
+def unpack(
+    message: bytes, listed: Literal["parts", "images"] = "parts"
+) -> tuple[dict[str, Any], list[bytes]]:
     """Split a binary message into header and parts; ProtocolError if its header is malformed or its length wrong."""
     if len(message) < 8 or message[:4] != MAGIC:
         raise ProtocolError(

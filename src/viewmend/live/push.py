@@ -141,7 +141,9 @@ class Box(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise ProtocolError("expected low < high on every axis of the bounds, got another order; swap them")
+            raise ProtocolError(
+                "expected low < high on every axis of the bounds, got another order; swap them"
+            )
 
 
 class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
@@ -161,7 +163,10 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
             raise ProtocolError("expected unique camera names, got one twice; rename it")
         if self.up is not None and sum(x * x for x in self.up) < 1e-12:
             raise ProtocolError("expected 'up' as a direction, got a zero vector; leave it out")
-        widest, highest = max(camera.width for camera in self.cameras), max(camera.height for camera in self.cameras)
+        widest, highest = (
+            max(camera.width for camera in self.cameras),
+            max(camera.height for camera in self.cameras),
+        )
         if (pixels := len(self.cameras) * widest * highest) > MAX_PIXELS:
             raise ProtocolError(
                 f"expected cameras x widest x highest of at most {MAX_PIXELS} pixels, got {pixels}; push smaller images"
@@ -178,14 +183,18 @@ class ImagePart(Struct, frozen=True):
 def _begin_rig(text: str, source: PushSource) -> Cameras:
     """Start the rig of a message `rig`; returns its cameras. ProtocolError if the message is malformed."""
     rig: RigMessage = read_message(text, RigMessage)
-    bounds = None if rig.bounds is None else Bounds(torch.tensor(rig.bounds.low), torch.tensor(rig.bounds.high))
+    bounds = (
+        None if rig.bounds is None else Bounds(torch.tensor(rig.bounds.low), torch.tensor(rig.bounds.high))
+    )
     source.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up))
     K, R, T = (torch.tensor([getattr(camera, key) for camera in rig.cameras]) for key in ("K", "R", "T"))
     size_px = torch.tensor([(camera.width, camera.height) for camera in rig.cameras])
     return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
 
 
-def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], bool]) -> MultiViewFrame | None:
+def _decode_frame(
+    message: bytes, cameras: Cameras, is_cancelled: Callable[[], bool]
+) -> MultiViewFrame | None:
     """One frame from its JPEGs and PNGs; cameras that lack the image or the mask are left out. None if cancelled.
 
     ProtocolError if an image is malformed or unexpected, or if fewer than two cameras are complete.
@@ -215,12 +224,17 @@ def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], b
     return MultiViewFrame(selected, rgb, mask, 0)
 
 
-def _decode_image(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.ndarray, "height width *channel"]:
+def _decode_image(
+    data: bytes, name: str, kind: str, cameras: Cameras
+) -> UInt8[np.ndarray, "height width *channel"]:
     width, height = cameras.size_px[cameras.names.index(name)].tolist()
     expected = f"camera '{name}': expected {kind} of {width} x {height} pixels"
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
-    if (size_px := size_from_header(data)) is not None and size_px != (width, height):  # checked before decoding
+    if (size_px := size_from_header(data)) is not None and size_px != (
+        width,
+        height,
+    ):  # checked before decoding
         raise ProtocolError(f"{expected}, got {size_px[0]} x {size_px[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
     image = decode_image(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)

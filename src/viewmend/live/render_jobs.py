@@ -201,7 +201,9 @@ class ImageJob(RenderJob[tuple[bytes, RenderResult]]):
         if self.done.done():
             return None
         asked = self._asked
-        pose = Camera(azimuth=asked.azimuth, elevation=asked.elevation, distance=asked.distance, fov_y=asked.fov_y)
+        pose = Camera(
+            azimuth=asked.azimuth, elevation=asked.elevation, distance=asked.distance, fov_y=asked.fov_y
+        )
         request = request_view(asked, pose, playback.edge if asked.time == "live" else asked.time, playback)
         return None if request is None else replace(request, without=asked.left_out, truth=asked.camera)
 
@@ -248,7 +250,11 @@ class PathJob(RenderJob[bytes]):
 
 
 def request_view(
-    asked: ViewOptions, pose: Camera, index: float | int, playback: PlaybackState, stereo_m: float | None = None
+    asked: ViewOptions,
+    pose: Camera,
+    index: float | int,
+    playback: PlaybackState,
+    stereo_m: float | None = None,
 ) -> RenderRequest | None:
     """The view of the nearest frame; None while that is being read."""
     index = int(playback.span.clamp(index))
@@ -257,7 +263,9 @@ def request_view(
     camera = view_camera(pose, playback.home, (asked.width, asked.height))
     eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.home.center)
     quality = RenderQuality(mend=asked.mode in protocol.COMPLETED_MODES | {"error"}, top_k=asked.top_k)
-    return RenderRequest(index, eyes, quality, asked.error_rule, protocol.EXTRA_MODES & {asked.mode}, model=asked.model)
+    return RenderRequest(
+        index, eyes, quality, asked.error_rule, protocol.EXTRA_MODES & {asked.mode}, model=asked.model
+    )
 
 
 def draw_eyes(asked: ViewOptions, result: RenderResult) -> Image:

@@ -168,7 +168,11 @@ class Renderer:
         home = home_view(cameras, center, rig.up)
         warm_up = view_camera(Camera(azimuth=home.azimuth), home, (WARM_UP_PX, WARM_UP_PX)).to(self._device)
         self._view(stream, warm_up, stream.viewer(), index, RenderQuality())
-        rig_json = {"name": rig.name, "cameras": cameras_json(cameras), "bounds": bounds_json(bounds or proxy.bounds)}
+        rig_json = {
+            "name": rig.name,
+            "cameras": cameras_json(cameras),
+            "bounds": bounds_json(bounds or proxy.bounds),
+        }
         self.assets_version = secrets.token_hex(4)
         rig_json["assets"] = self.assets_version if self._draws_in_page else None
         self.rig_json = rig_json | home.as_json() | {"fps": self._source.span.fps or None}
@@ -202,7 +206,10 @@ class Renderer:
         completed = [view.completed for view in views]
         inpainter, scored = self._inpainter, completed[0]
         if request.model is not None:
-            others = [self._complete_by(request.model, cached, camera, without, request.quality) for camera in cameras]
+            others = [
+                self._complete_by(request.model, cached, camera, without, request.quality)
+                for camera in cameras
+            ]
             for images, other in zip(extra, others, strict=True):
                 images["compared"] = torch.cat([other.rgb, other.opacity[None]])
             times += StageTimes(inpainting=1000 * (time.perf_counter() - start) - times.rendering)
@@ -228,7 +235,9 @@ class Renderer:
         """Those of these names that are cameras of the rig, in its order; ValueError if fewer than two are left."""
         own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
         if names and len(set(own) - set(names)) < 2:
-            raise ValueError(f"expected two input cameras or more, got {len(set(own) - set(names))}; leave out fewer")
+            raise ValueError(
+                f"expected two input cameras or more, got {len(set(own) - set(names))}; leave out fewer"
+            )
         return tuple(name for name in own if name in names)
 
     def make_assets(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> FrameAssets:
@@ -280,7 +289,12 @@ class Renderer:
         return self._variants[key]
 
     def _complete_by(
-        self, model: str, cached: CachedFrame, camera: Cameras, without: tuple[str, ...], quality: RenderQuality
+        self,
+        model: str,
+        cached: CachedFrame,
+        camera: Cameras,
+        without: tuple[str, ...],
+        quality: RenderQuality,
     ) -> CompletedView:
         """The view by another model, behind the same geometry."""
         stream = self._stream_of(model, without)
@@ -304,7 +318,9 @@ class Renderer:
         true = camera_image(truth, background)
         seen = composite(background, completed.rgb, completed.opacity)
         errors = (seen - true).abs().amax(0)
-        return psnr(seen, true, truth.mask[0] > FOREGROUND), torch.stack([*[errors] * 3, torch.ones_like(errors)])
+        return psnr(seen, true, truth.mask[0] > FOREGROUND), torch.stack(
+            [*[errors] * 3, torch.ones_like(errors)]
+        )
 
     def _render_proxy(self, cached: CachedFrame, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Images of the proxy; the vertex colours are computed once per frame."""
@@ -339,7 +355,9 @@ class Renderer:
         # on a GPU, camera images are encoded when they are used
         return stream.add_frame(shared.frame.to(self._device), shared.proxy.to(self._device))
 
-    def _view(self, stream: Stream, camera: Cameras, viewer: State, index: int, quality: RenderQuality) -> StreamView:
+    def _view(
+        self, stream: Stream, camera: Cameras, viewer: State, index: int, quality: RenderQuality
+    ) -> StreamView:
         """One view; with its holes if the model fails."""
         if not quality.mend:
             return stream.view(camera, viewer, index, quality)

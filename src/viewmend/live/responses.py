@@ -41,7 +41,9 @@ def page_files() -> dict[str, Asset]:
     root = Path(__file__).parent / "page"
     paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
     return {
-        path.as_posix(): Asset((root / path).read_bytes(), MEDIA_TYPES.get(path.suffix, "application/octet-stream"))
+        path.as_posix(): Asset(
+            (root / path).read_bytes(), MEDIA_TYPES.get(path.suffix, "application/octet-stream")
+        )
         for path in paths
         if not any(part.startswith((".", "_")) for part in path.parts)
     }
@@ -54,7 +56,9 @@ def error_response(status: int, message: str) -> Response:
 
 def asset_response(request: Request, asset: Asset, is_final: bool) -> Response:
     """An asset with its cache headers, or 304 if the client has it; final ones never change under their address."""
-    scope = "private" if "authorization" in request.headers else "public"  # the address is enough only with a token
+    scope = (
+        "private" if "authorization" in request.headers else "public"
+    )  # the address is enough only with a token
     cache = f"{scope}, max-age={MAX_AGE_S}, immutable" if is_final else f"{scope}, no-cache"
     headers = {"ETag": asset.etag, "Cache-Control": cache, "X-Content-Type-Options": "nosniff"}
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
@@ -90,9 +94,18 @@ def metrics_text(registry: SessionRegistry) -> str:
         *metric("viewmend_up", "gauge", "1 while views can be rendered.", ready),
         *metric("viewmend_viewers", "gauge", "Connected viewers.", len(registry.sessions)),
         *metric("viewmend_frames_total", "counter", "Rendered views.", counts["frames"]),
-        *metric("viewmend_shared_total", "counter", "Views of a frame with known geometry.", counts["shared"]),
-        *metric("viewmend_dropped", "gauge", "Looks of present viewers replaced before they were rendered.", dropped),
-        *metric("viewmend_cancelled_total", "counter", "Views that were not needed any more.", counts["cancelled"]),
+        *metric(
+            "viewmend_shared_total", "counter", "Views of a frame with known geometry.", counts["shared"]
+        ),
+        *metric(
+            "viewmend_dropped",
+            "gauge",
+            "Looks of present viewers replaced before they were rendered.",
+            dropped,
+        ),
+        *metric(
+            "viewmend_cancelled_total", "counter", "Views that were not needed any more.", counts["cancelled"]
+        ),
         *metric("viewmend_errors_total", "counter", "Views that failed.", counts["errors"]),
         *metric("viewmend_source_frames", "gauge", "Frames that can be requested.", source.span.end),
         *metric("viewmend_stage_seconds_total", "counter", "Seconds spent in each stage.", stages),
@@ -108,7 +121,9 @@ def metrics_text(registry: SessionRegistry) -> str:
             if event != "up"
         }
         lines += metric("viewmend_camera_up", "gauge", "1 while the camera delivers images.", up)
-        lines += metric("viewmend_camera_pictures_total", "counter", "Images of each camera by event.", images)
+        lines += metric(
+            "viewmend_camera_pictures_total", "counter", "Images of each camera by event.", images
+        )
     if (spread_ms := source.spread_ms) is not None:
         text = "Time between the first and the last image of the newest frame."
         lines += metric("viewmend_cameras_apart_seconds", "gauge", text, spread_ms / 1000)

@@ -202,7 +202,9 @@ class LiveServer:
         if renderer.rig_json is not None:
             names = [camera["name"] for camera in renderer.rig_json["cameras"]]
             if asked.camera is not None and asked.camera not in names:
-                raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got '{asked.camera[:40]}'")
+                raise ProtocolError(
+                    f"expected a camera among {', '.join(names)[:200]}, got '{asked.camera[:40]}'"
+                )
             try:
                 renderer.left_out(asked.left_out)
             except ValueError as error:
@@ -243,7 +245,9 @@ class LiveServer:
                 frame = await wait_for_frame(source.read, index, SOURCE_IMAGE_S)
                 assert frame.mask is not None, "frames with geometry have masks"
                 try:
-                    points.append(await asyncio.to_thread(coarse_surface, frame.mask, frame.cameras, source.rig.bounds))
+                    points.append(
+                        await asyncio.to_thread(coarse_surface, frame.mask, frame.cameras, source.rig.bounds)
+                    )
                 except ValueError as error:
                     return error_response(503, str(error))
                 if await request.is_disconnected():
@@ -259,7 +263,9 @@ class LiveServer:
         span, version = self._service.source.span, self._service.renderer.assets_version
         if version is None or not span.first <= asked.time < span.end:
             there = (
-                f"from {span.first} to {span.end - 1}" if span.first < span.end else "that exists (there is none yet)"
+                f"from {span.first} to {span.end - 1}"
+                if span.first < span.end
+                else "that exists (there is none yet)"
             )
             return error_response(404, f"expected a frame {there}, got {asked.time}; see /health")
         try:
@@ -268,7 +274,9 @@ class LiveServer:
         except ValueError as error:
             return error_response(404, f"this frame cannot be drawn: {error}"[:400])
         if asked.camera is not None and asked.camera >= len(made.images):
-            return error_response(404, f"expected a camera from 0 to {len(made.images) - 1}, got {asked.camera}")
+            return error_response(
+                404, f"expected a camera from 0 to {len(made.images) - 1}, got {asked.camera}"
+            )
         asset = made.shape if asked.camera is None else made.images[asked.camera]
         return asset_response(request, asset, is_final=asked.v == version)
 
@@ -283,7 +291,9 @@ class LiveServer:
         try:
             body = await responses.read_body(request)
             if body is None:
-                return error_response(413, f"expected a body of at most {MAX_BODY_BYTES} bytes; send fewer poses")
+                return error_response(
+                    413, f"expected a body of at most {MAX_BODY_BYTES} bytes; send fewer poses"
+                )
             # Parsed on a thread, as a megabyte of JSON would block the event loop.
             job = PathJob(await asyncio.to_thread(render_jobs.parse_path, body, self._config.limits))
             self._path_job = job
@@ -328,7 +338,11 @@ class LiveServer:
             return
         if not isinstance(source, PushSource) or self._is_pushing:
             kind = "reads its own cameras" if source.span.live else "plays a recording"
-            reason = "another rig is pushing" if self._is_pushing else f"this server {kind}; start viewmend serve live"
+            reason = (
+                "another rig is pushing"
+                if self._is_pushing
+                else f"this server {kind}; start viewmend serve live"
+            )
             await socket.send_denial_response(error_response(409, reason))
             return
         self._is_pushing = True

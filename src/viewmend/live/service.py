@@ -31,7 +31,9 @@ log = logging.getLogger("viewmend.live")
 class RenderService:
     """Owns the renderer and its thread. Sessions are changed while holding `lock`; `now` is the clock of all."""
 
-    def __init__(self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic
+    ) -> None:
         self.renderer, self.source, self.now = renderer, source, now
         self.lock = threading.Condition()
         self.changed: Callable[[], None] = lambda: None

@@ -214,7 +214,9 @@ class ViewerSession:
         self.requested = RequestedView(look, index)
         return self._request(look, index, playback.home)
 
-    def _next_level(self, look: Look, is_new: bool, now: float, playback: PlaybackState) -> QualityLevel | None:
+    def _next_level(
+        self, look: Look, is_new: bool, now: float, playback: PlaybackState
+    ) -> QualityLevel | None:
         """The level of a new view, or a better one for a view that is still; None if there is nothing to render."""
         plays = self.clock.playing and playback.span.fps > 0
         at_rest = not look.moving and not plays
@@ -253,7 +255,9 @@ class ViewerSession:
             return level if look.adaptive else replace(level, scale=1.0)
         self.budget.target_ms = self.budget.budget_ms / active_viewers
         level = self.budget.level
-        return replace(level, scale=level.scale * min(1.0, 1 / self._enlarged(look)) if look.adaptive else 1.0)
+        return replace(
+            level, scale=level.scale * min(1.0, 1 / self._enlarged(look)) if look.adaptive else 1.0
+        )
 
     def _enlarged(self, look: Look) -> float:
         """Ratio of the side lengths of this look's image to those of a moving one."""

@@ -17,8 +17,21 @@ STRINGS = {"vp9": "vp09.00.41.08.01.01.01.06.00", "h264": "avc1.42E02A"}
 """Codec strings for VideoDecoder.configure, with profiles and levels for every size within the limits. For VP9,
 browsers take the colour space from this string, not from the stream."""
 OPTIONS = {
-    "vp9": {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0", "row-mt": "1", "crf": "24", "b": "0"},
-    "h264": {"preset": "ultrafast", "tune": "zerolatency", "crf": "21", "profile": "baseline", "level": "4.2"},
+    "vp9": {
+        "deadline": "realtime",
+        "cpu-used": "8",
+        "lag-in-frames": "0",
+        "row-mt": "1",
+        "crf": "24",
+        "b": "0",
+    },
+    "h264": {
+        "preset": "ultrafast",
+        "tune": "zerolatency",
+        "crf": "21",
+        "profile": "baseline",
+        "level": "4.2",
+    },
 }
 MAX_KEY_INTERVAL = 240
 """Frames from one key frame to the next."""
@@ -52,7 +65,9 @@ class VideoStream:
         kind = (codec, image.shape[1], image.shape[0])
         if self._context is None or kind != self._kind:
             self._context, self._kind, self._count = _open(*kind), kind, 0
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24").reformat(format="yuv420p")
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24").reformat(
+            format="yuv420p"
+        )
         frame.pts = self._count
         frame.pict_type = PictureType.I if key or self._count % MAX_KEY_INTERVAL == 0 else PictureType.NONE
         self._count += 1

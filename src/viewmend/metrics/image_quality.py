@@ -116,7 +116,9 @@ def _ssim_of_windows(
     x: Float[Tensor, "channel height width"], y: Float[Tensor, "channel height width"], window: SsimWindow
 ) -> Float[Tensor, "inner_height inner_width"]:
     size = SSIM_SIZE_PX[window]
-    mean_x, mean_y, square_x, square_y, product = _windowed(torch.cat([x, y, x * x, y * y, x * y]), window).chunk(5)
+    mean_x, mean_y, square_x, square_y, product = _windowed(
+        torch.cat([x, y, x * x, y * y, x * y]), window
+    ).chunk(5)
     sample = 1.0 if window == "gaussian" else size**2 / (size**2 - 1)
     variance_x = sample * (square_x - mean_x**2)
     variance_y = sample * (square_y - mean_y**2)
@@ -133,7 +135,11 @@ def _windowed(
     """Weighted means over all windows that lie inside the image."""
     size = SSIM_SIZE_PX[window]
     offset = torch.arange(size, device=image.device, dtype=image.dtype) - size // 2
-    kernel = torch.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2) if window == "gaussian" else torch.ones_like(offset)
+    kernel = (
+        torch.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2) if window == "gaussian" else torch.ones_like(offset)
+    )
     kernel = kernel / kernel.sum()
-    across, down = (kernel.view(shape).expand(len(image), 1, -1, -1) for shape in ((1, 1, 1, -1), (1, 1, -1, 1)))
+    across, down = (
+        kernel.view(shape).expand(len(image), 1, -1, -1) for shape in ((1, 1, 1, -1), (1, 1, -1, 1))
+    )
     return F.conv2d(F.conv2d(image[None], across, groups=len(image)), down, groups=len(image))[0]

@@ -20,7 +20,10 @@ DEVIATION = (0.229, 0.224, 0.225)
 """ImageNet's standard deviation of RGB in [0, 1]; equivalent to LPIPS' scale of [-1, 1]."""
 TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """The ReLUs whose features are compared."""
-CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+CHANNELS: dict[Backbone, tuple[int, ...]] = {
+    "alex": (64, 192, 384, 256, 256),
+    "vgg": (64, 128, 256, 512, 512),
+}
 MIN_PX: dict[Backbone, int] = {"alex": 63, "vgg": 16}
 """Smaller images have no features in the last layer."""
 
@@ -75,7 +78,9 @@ class Lpips(nn.Module):
             for index, layer in enumerate(self.features):
                 x = layer(x)
                 if index in TAPS[self.backbone]:
-                    unit = x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()  # its gradient is finite at 0, too
+                    unit = (
+                        x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
+                    )  # its gradient is finite at 0, too
                     a, b = unit.chunk(2)
                     found.append(torch.einsum("c,nchw->nhw", self.heads[len(found)], (a - b).square()))
             return found

@@ -65,7 +65,9 @@ def known_weights(name: str) -> KnownWeights:
     for known in KNOWN:
         if known.name == name:
             return known
-    raise ValueError(f"expected weights among {', '.join(k.name for k in KNOWN)}, got '{name}'; see viewmend weights")
+    raise ValueError(
+        f"expected weights among {', '.join(k.name for k in KNOWN)}, got '{name}'; see viewmend weights"
+    )
 
 
 def weight_cache() -> Path:

@@ -59,7 +59,9 @@ class RenderQuality:
 def check_exclude(exclude: Sequence[str]) -> None:
     """ValueError if this is a string and no list of names: its letters would exclude nothing."""
     if isinstance(exclude, str):
-        raise ValueError(f"expected exclude as a list of names, got the string '{exclude}'; write ['{exclude}']")
+        raise ValueError(
+            f"expected exclude as a list of names, got the string '{exclude}'; write ['{exclude}']"
+        )
 
 
 class ContextProvider:
@@ -147,7 +149,9 @@ class ContextProvider:
                     for name, result in zip(views.frame.cameras.names, results, strict=True):
                         memory[kind, name] = to_mmap(result)
 
-        return [memory[kind, name] for memory in memories.values() for name in usable if (kind, name) in memory]
+        return [
+            memory[kind, name] for memory in memories.values() for name in usable if (kind, name) in memory
+        ]
 
     def remembered(
         self,

@@ -44,7 +44,9 @@ def shipped_models() -> tuple[str, ...]:
     return tuple(sorted(found | ({RAYS} if "views" in found else set())))
 
 
-def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "auto") -> Model:
+def load_inpainter(
+    name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "auto"
+) -> Model:
     """Load a shipped model or a model folder, ready for `Stream`.
 
     Args:

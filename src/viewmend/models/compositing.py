@@ -59,8 +59,12 @@ def cut(completed: CompletedView) -> CompletedView:
     if mask is None:
         return completed
     alpha = completed.view.mask if completed.alpha is None else completed.alpha
-    confidence, depth = (None if p is None else p * (mask > 0) for p in (completed.confidence, completed.depth))
-    return replace(completed, rgb=completed.rgb * mask, alpha=alpha * mask, confidence=confidence, depth=depth)
+    confidence, depth = (
+        None if p is None else p * (mask > 0) for p in (completed.confidence, completed.depth)
+    )
+    return replace(
+        completed, rgb=completed.rgb * mask, alpha=alpha * mask, confidence=confidence, depth=depth
+    )
 
 
 def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:

@@ -42,7 +42,9 @@ METHODS: dict[str, str] = {
     "rgvi": "viewmend.contrib.baselines.rgvi:make_rgvi",
 }
 """MODULE:NAME of each method's factory, imported on demand, and called with the device if it takes one."""
-FAMILIES = dict.fromkeys(("dstt", "fuseformer", "e2fgvi"), "viewmend.contrib.baselines.published:make_baseline")
+FAMILIES = dict.fromkeys(
+    ("dstt", "fuseformer", "e2fgvi"), "viewmend.contrib.baselines.published:make_baseline"
+)
 """MODULE:NAME of the factory of all methods whose names start with this word; called with the name and the device."""
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"
@@ -63,7 +65,9 @@ def method_names(selection: str) -> tuple[str, ...]:
     parts = [part.strip() for part in selection.split(",") if part.strip()]
     names = [name for part in parts for name in groups.get(part, (part,))]
     if not names:
-        raise ValueError(f"expected 'all' or names with commas, got '{selection}'; see viewmend evaluate --help")
+        raise ValueError(
+            f"expected 'all' or names with commas, got '{selection}'; see viewmend evaluate --help"
+        )
     return tuple(dict.fromkeys(names))
 
 
@@ -162,7 +166,9 @@ def identity(inpainter: object) -> str:
     """Class, parameters and SHA-256 of the weights of an inpainter: a key of cached results. Code is not included."""
     if isinstance(inpainter, nn.Module):
         own = {name: value for name, value in vars(inpainter).items() if not isinstance(value, nn.Module)}
-        plain = {name: value for name, value in own.items() if not name.startswith("_") and name != "training"}
+        plain = {
+            name: value for name, value in own.items() if not name.startswith("_") and name != "training"
+        }
         return f"{_class(inpainter)}({identity(dict(inpainter.state_dict()))}, {identity(plain)})"
     if isinstance(inpainter, Tensor):
         data = inpainter.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
@@ -176,7 +182,9 @@ def identity(inpainter: object) -> str:
     if isinstance(inpainter, str | int | float | bool | Enum | Path | torch.dtype | None):
         return repr(inpainter)
     if isinstance(inpainter, partial):
-        return f"partial({identity(inpainter.func)}, {identity(inpainter.args)}, {identity(inpainter.keywords)})"
+        return (
+            f"partial({identity(inpainter.func)}, {identity(inpainter.args)}, {identity(inpainter.keywords)})"
+        )
     if is_dataclass(inpainter) and not isinstance(inpainter, type):
         return f"{_class(inpainter)}({identity({f.name: getattr(inpainter, f.name) for f in fields(inpainter)})})"
     if callable(inpainter) and hasattr(inpainter, "__qualname__"):

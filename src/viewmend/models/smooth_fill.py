@@ -36,12 +36,16 @@ class Fill(Inpainter):
         return self.margin_px
 
     @torch.no_grad()
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, State]:
         """The view with E filled; a view without E is returned as it is."""
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
         filled = self.fill_view(view, context)
-        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask), clamp=False)), state
+        return CompletedView(
+            view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask), clamp=False)
+        ), state
 
 
 class SmoothFill(Fill):

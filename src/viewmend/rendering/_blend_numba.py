@@ -54,7 +54,9 @@ def _average(colour, weights, total, row, column, rgb, disagreement):
 
 # Inlined: passing these arrays costs as much as the computation.
 @kernel(inline="always")
-def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
+def _weigh(
+    point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour
+):
     """Weight of one camera at a surface point; its sample goes into `colour[view]`."""
     x, y, w = point
     to_camera = _unit(centers[view, 0] - x, centers[view, 1] - y, centers[view, 2] - w)
@@ -87,7 +89,9 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
         there = depths[view, row, column]
         if there > 0 and there < nearest:
             continue
-        part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
+        part = (bottom_share if tap // 2 else 1 - bottom_share) * (
+            right_share if tap % 2 else 1 - right_share
+        )
         if masks.shape[0]:
             part *= masks[view, row, column] * (1 / 255)
         usable += part

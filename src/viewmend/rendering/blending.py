@@ -113,7 +113,9 @@ def _blend_cpu(
     )
 
     # bands of rows, shared among the threads
-    blended = Blend(torch.zeros(3, *depth.shape), torch.zeros(len(rig), *depth.shape), torch.zeros(depth.shape))
+    blended = Blend(
+        torch.zeros(3, *depth.shape), torch.zeros(len(rig), *depth.shape), torch.zeros(depth.shape)
+    )
     outputs = (blended.rgb.numpy(), blended.weights.numpy(), blended.disagreement.numpy())
 
     def work(band: int) -> None:

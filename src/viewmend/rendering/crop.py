@@ -39,7 +39,9 @@ class Crop:
             return camera
         return camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
 
-    def of_image(self, image: Shaped[Tensor, "*channel height width"]) -> Shaped[Tensor, "*channel _rows _columns"]:
+    def of_image(
+        self, image: Shaped[Tensor, "*channel height width"]
+    ) -> Shaped[Tensor, "*channel _rows _columns"]:
         """This part of an image, without copying."""
         return image[..., self.top : self.bottom, self.left : self.right]
 
@@ -61,7 +63,9 @@ class Crop:
         """`view` completed by this part of it, whose error mask becomes the view's. Other pixels keep their colour."""
         if self == Crop.all_of(view.camera):
             return part
-        images = {name: self._padded(image, view.camera) for name, image in part.images.items() if name != "rgb"}
+        images = {
+            name: self._padded(image, view.camera) for name, image in part.images.items() if name != "rgb"
+        }
         error = self._padded(part.view.error, view.camera)
         fade = None if part.view.fade is None else self._padded(part.view.fade, view.camera)
         rgb = view.cut_rgb

@@ -63,10 +63,18 @@ def hull_points(
         row = uv[0, :, 1].long().clamp(0, height - 1)
         surface = proxy.depth(camera)[0][row, column]
         visible = in_view(uv, z, camera)[0] & ((surface == 0) | (z[0] <= surface + BEHIND * apart_m))
-        order = torch.where(visible, z[0], 0.0).argsort(descending=True)[: int(visible.sum())]  # the farthest first
+        order = torch.where(visible, z[0], 0.0).argsort(descending=True)[
+            : int(visible.sum())
+        ]  # the farthest first
         sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(1, MAX_DOT_PX).long()
         rgba = torch.cat([colours, torch.ones_like(colours[:, :1])], 1)[order]
-        _draw(image, row[order].cpu().numpy(), column[order].cpu().numpy(), sides.cpu().numpy(), rgba.cpu().numpy())
+        _draw(
+            image,
+            row[order].cpu().numpy(),
+            column[order].cpu().numpy(),
+            sides.cpu().numpy(),
+            rgba.cpu().numpy(),
+        )
     return torch.from_numpy(image).movedim(-1, 0).to(colours)
 
 
@@ -91,7 +99,9 @@ def vertex_colours(proxy: GeometryProxy, views: ContextViews) -> Float[Tensor, "
         surface = depth[row.clamp(0, depth.shape[0] - 1), column.clamp(0, depth.shape[1] - 1)]
 
         # add the colours of the visible ones, by their angle to the camera
-        visible = in_view(uv, z, camera)[0] & (surface > 0) & (z[0] <= surface + bias_m) & (sample[:, 3] > MIN_MASK)
+        visible = (
+            in_view(uv, z, camera)[0] & (surface > 0) & (z[0] <= surface + bias_m) & (sample[:, 3] > MIN_MASK)
+        )
         to_camera = F.normalize(camera.centers - vertices, dim=-1)
         weight = visible * (proxy.normals * to_camera).sum(-1).clamp(min=0) ** FRONTAL_POWER
         colour = sample[:, :3] / sample[:, 3:].clamp(min=MIN_MASK)
@@ -117,7 +127,9 @@ def _draw(
         image[y[inside], x[inside]] = colours[own][np.nonzero(inside)[0]]
 
 
-def _spread(colours: Float[Tensor, "vertex 3"], known: Bool[Tensor, "vertex"], mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+def _spread(
+    colours: Float[Tensor, "vertex 3"], known: Bool[Tensor, "vertex"], mesh: Mesh
+) -> Float[Tensor, "vertex 3"]:
     """The colours, with those of unknown vertices taken from their neighbours, ring by ring."""
     faces = mesh.faces.long()
     sides = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -127,7 +139,9 @@ def _spread(colours: Float[Tensor, "vertex 3"], known: Bool[Tensor, "vertex"], m
         if not len(reached):
             return colours
         sums = colours.new_zeros(len(colours), 4)
-        sums.index_add_(0, reached[:, 1], torch.cat([colours[reached[:, 0]], colours.new_ones(len(reached), 1)], 1))
+        sums.index_add_(
+            0, reached[:, 1], torch.cat([colours[reached[:, 0]], colours.new_ones(len(reached), 1)], 1)
+        )
         new = sums[:, 3] > 0
         colours = torch.where(new[:, None], sums[:, :3] / sums[:, 3:].clamp(min=1), colours)
         known = known | new

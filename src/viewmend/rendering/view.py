@@ -52,7 +52,9 @@ class RenderConfig:
         if not isinstance(self.cameras, Integral) or self.cameras < 1:
             raise ValueError(f"expected a whole number of source cameras, at least 1, got {self.cameras}")
         if self.selection not in SELECTIONS:
-            raise ValueError(f"expected a selection of views by 'angle' or 'direction', got '{self.selection}'")
+            raise ValueError(
+                f"expected a selection of views by 'angle' or 'direction', got '{self.selection}'"
+            )
         if not 0 < self.refine_fraction <= 1:
             raise ValueError(f"expected a refine_fraction above 0 and up to 1, got {self.refine_fraction}")
 
@@ -171,7 +173,11 @@ def _colour(
 
 
 def select_closest(
-    target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"], k: int = 3, selection: str = "angle"
+    target: Cameras,
+    cameras: Cameras,
+    subject_center: Float[Tensor, "3"],
+    k: int = 3,
+    selection: str = "angle",
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 

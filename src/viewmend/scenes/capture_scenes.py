@@ -69,7 +69,9 @@ def capture_set(
     capture = open_masked(folder, held=1, format=format)
     names = capture.cameras.names
     if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
-        raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
+        raise ValueError(
+            f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'"
+        )
     if frames is not None and frames < 1:
         raise ValueError(f"expected --frames of at least 1, got {frames}; omit it for all")
     looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
@@ -113,13 +115,17 @@ def _fingerprint(folder: Path, format: str | None) -> str:
     is_file = folder.name == CALIBRATION and folder.is_file()
     plain = read_any_calibration(folder.parent if is_file else folder, format)
     folder = plain.folder
-    named = {c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames}
+    named = {
+        c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames
+    }
     files = sorted({container_of(folder / name) for name in named})
     stats = [(str(file.relative_to(folder)), file.stat()) for file in files if file.is_file()]
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     calibration = plain.file.read_bytes()
     if plain.file.name != CALIBRATION:  # there may be other files in the folder
-        calibration = repr([(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]).encode()
+        calibration = repr(
+            [(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]
+        ).encode()
     return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()
 
 
@@ -171,19 +177,25 @@ def make_splits(
     names = [scene.name for scene in made]
     twice = sorted({name for name in names if names.count(name) > 1})
     if scenes is not None and scenes > len(made):
-        raise ValueError(f"expected at least the {scenes} captures of --scenes, got {len(made)}; name more captures")
+        raise ValueError(
+            f"expected at least the {scenes} captures of --scenes, got {len(made)}; name more captures"
+        )
     made = sorted(made, key=lambda one: _hash(seed, "scene", one.name))[:scenes]
     subjects = sorted({scene.subject for scene in made}, key=lambda one: _hash(seed, "subject", one))
     if twice or len(subjects) < 2:
         got = f"{twice[:3]} twice" if twice else f"the subjects {subjects}"
-        raise ValueError(f"expected captures of different names and of two subjects or more, got {got}; see --subject")
+        raise ValueError(
+            f"expected captures of different names and of two subjects or more, got {got}; see --subject"
+        )
     tested: set[str] = set()
     for one in subjects[:-1]:
         if tested and sum(scene.subject in tested for scene in made) >= test_fraction * len(made) - 1e-9:
             break
         tested.add(one)
     split = [structs.replace(s, split="test" if s.subject in tested else "training") for s in made]
-    return SplitFile(format=FORMAT, seed=seed, scenes=tuple(sorted(split, key=lambda s: (s.split, s.subject, s.name))))
+    return SplitFile(
+        format=FORMAT, seed=seed, scenes=tuple(sorted(split, key=lambda s: (s.split, s.subject, s.name)))
+    )
 
 
 def splits_json(splits: SplitFile) -> str:
@@ -212,7 +224,9 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
     """Test scenes of a file, with all cameras but one as inputs; ValueError if a capture has changed or is absent."""
     found = []
     for scene, path in _scenes_of(file, "test"):
-        held = next(one for one in capture_set(path, frames=frames, format=scene.format) if one.held == scene.left_out)
+        held = next(
+            one for one in capture_set(path, frames=frames, format=scene.format) if one.held == scene.left_out
+        )
         found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
     return tuple(found)
 
@@ -230,11 +244,15 @@ def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple
     """One part of a file, and where its captures are; ValueError for one that is absent or was recalibrated."""
     scenes = [scene for scene in read_splits(file).scenes if scene.split == split]
     if not scenes:
-        raise ValueError(f"{file}: expected a scene for {split}, got none; make splits of two subjects or more")
+        raise ValueError(
+            f"{file}: expected a scene for {split}, got none; make splits of two subjects or more"
+        )
     for scene in scenes:
         path = file.parent / scene.path
         if not path.exists():
-            raise ValueError(f"{file}: expected the capture {path}, got none; put the file where its paths hold")
+            raise ValueError(
+                f"{file}: expected the capture {path}, got none; put the file where its paths hold"
+            )
         if (now := _calibration_sha256(path, scene.format)) != scene.calibration_sha256:
             raise ValueError(
                 f"{path}: expected the calibration that {file.name} was made with, {scene.calibration_sha256[:12]}, "
@@ -257,7 +275,9 @@ def _scene(path: Path, base: Path, seed: int, subject: str, format: str | None) 
         expected = f"a subject by --subject '{subject}' in '{capture.name}'"
         raise ValueError(f"expected {expected}, got none; (..) is its group")
     if len(names) < CLOSEST + 1:
-        raise ValueError(f"{path}: expected {CLOSEST + 1} cameras or more, got {len(names)}; leave the capture out")
+        raise ValueError(
+            f"{path}: expected {CLOSEST + 1} cameras or more, got {len(names)}; leave the capture out"
+        )
     held = names[_hash(seed, "camera", capture.name) % len(names)]
     others = capture.cameras.select([name for name in names if name != held])
     closest = select_closest(capture.cameras.select([held]), others, _looked_at(capture.cameras), CLOSEST)
@@ -287,5 +307,8 @@ def _looked_at(cameras: Cameras) -> torch.Tensor:
 
 def _calibration_sha256(path: Path, format: str | None) -> str:
     cameras = read_any_calibration(path, format).cameras
-    values = [[c.name, c.width, c.height, *(n.round(6).tolist() for n in (c.K, c.R, c.t_m, c.dist))] for c in cameras]
+    values = [
+        [c.name, c.width, c.height, *(n.round(6).tolist() for n in (c.K, c.R, c.t_m, c.dist))]
+        for c in cameras
+    ]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()

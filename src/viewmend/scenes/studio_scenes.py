@@ -133,7 +133,9 @@ class StudioScene(LeaveOneOutScene):
         return studio.read(time, names), studio.silhouettes(time, rest) if rest else None
 
 
-def _true_surface(mesh: Mesh, drawn: MultiViewFrame, carving: Silhouettes | None, scored: bool) -> TrueSurface:
+def _true_surface(
+    mesh: Mesh, drawn: MultiViewFrame, carving: Silhouettes | None, scored: bool
+) -> TrueSurface:
     """The surface of a frame, as seen by the cameras that are coloured, and when it is scored by all others."""
     if carving is None or not scored:
         return TrueSurface.of(mesh, drawn.cameras, drawn.depth)
@@ -152,7 +154,9 @@ def procedural_set(
     for n, seed in enumerate(P_SEEDS):
         cameras = RINGS[n % 2]
         tempo = TEMPOS[n % 3]
-        config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background)
+        config = StudioConfig(
+            seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background
+        )
         scenes.append(_scene(f"{name}-{seed}", name, cameras, tempo, config, tempo=tempo))
     return tuple(scenes)
 
@@ -160,7 +164,9 @@ def procedural_set(
 def _scene(name: str, set: str, cameras: int, style: str, config: StudioConfig, **more: Any) -> StudioScene:
     """A scene seen by a ring of cameras, of which the seed leaves out one: any, but not in step with the seed."""
     held = _held(config.seed, cameras)
-    return StudioScene(name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more)
+    return StudioScene(
+        name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more
+    )
 
 
 def _held(seed: int, cameras: int) -> str:
@@ -218,7 +224,9 @@ def performer_rig_scenes(
 ) -> tuple[StudioScene, ...]:
     """Candidates for `rig_set`: every glTF character with every motion; CaptureError without either."""
     scenes = []
-    for seed, (person, clip, sha256) in zip(RIG_PERFORMER_SEEDS, _people_and_clips(folder, motions), strict=False):
+    for seed, (person, clip, sha256) in zip(
+        RIG_PERFORMER_SEEDS, _people_and_clips(folder, motions), strict=False
+    ):
         scene = _rig_scene(name, f"{name}-{person.stem}-{clip.stem}", seed, size_px)
         config = replace(scene.config, performers=person, motions=clip)
         scenes.append(replace(scene, style=clip.stem, config=config, files_sha256=sha256))
@@ -276,7 +284,9 @@ def _people_and_clips(folder: Path, motions: Path | None) -> list[tuple[Path, Pa
     places = (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder)
     clips = _files(places, (".bvh",), "motions")
     sha256 = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*people, *clips)}
-    return [(person, clip, (sha256[person], sha256[clip])) for person, clip in itertools.product(people, clips)]
+    return [
+        (person, clip, (sha256[person], sha256[clip])) for person, clip in itertools.product(people, clips)
+    ]
 
 
 def _files(places: Sequence[Path], suffixes: tuple[str, ...], what: str) -> list[Path]:
@@ -286,4 +296,6 @@ def _files(places: Sequence[Path], suffixes: tuple[str, ...], what: str) -> list
         if found:
             return found
     tried = ", ".join(str(place) for place in places)
-    raise CaptureError(f"expected {what} ({', '.join(suffixes)}) in one of {tried}, found none; check --performers")
+    raise CaptureError(
+        f"expected {what} ({', '.join(suffixes)}) in one of {tried}, found none; check --performers"
+    )

@@ -47,7 +47,9 @@ class TrueSurface:
     """True z-depth, metres, in half precision: a step at 4 m is 4 mm, and `VISIBLE_M` is more."""
 
     @classmethod
-    def of(cls, mesh: Mesh, cameras: Cameras, depth: Float[Tensor, "view height width"] | None = None) -> "TrueSurface":
+    def of(
+        cls, mesh: Mesh, cameras: Cameras, depth: Float[Tensor, "view height width"] | None = None
+    ) -> "TrueSurface":
         """The surface, and its true depth in these cameras, which is rendered unless it is given."""
         depth = rasterize(mesh, cameras).depth if depth is None else depth
         return cls(mesh.vertices, cameras, depth.half())
@@ -84,7 +86,9 @@ class SurfaceSeen:
         return PixelOrigins(now, by_any & ~now, before & ~by_any, before & ~now)
 
 
-def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh: Mesh, target: Cameras) -> SurfaceSeen:
+def surface_seen(
+    surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh: Mesh, target: Cameras
+) -> SurfaceSeen:
     """What the cameras saw, at these times, of the surface that the view of the camera `target` shows.
 
     `surfaces` are by time. The view's own time is the first and has all cameras; the others may have fewer, and what

@@ -99,7 +99,9 @@ def _hierarchy(path: Path, text: str) -> list[_Joint]:
     if roots != 1:
         raise CaptureError(f"{path}: expected one ROOT, found {roots}; export one skeleton")
     if not all(abs(x) < 1e9 for j in joints for x in j.offset):
-        raise CaptureError(f"{path}: expected three finite numbers after each OFFSET, got others; export it again")
+        raise CaptureError(
+            f"{path}: expected three finite numbers after each OFFSET, got others; export it again"
+        )
     return joints
 
 

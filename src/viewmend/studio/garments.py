@@ -31,7 +31,9 @@ LIMBS = {
 Limbs = Int[np.ndarray, "height width"]
 """Positions in `NAMES`, -1 for none."""
 NAMES = tuple(LIMBS)
-TRUNK, LEGS, FEET, HANDS, HEAD = (NAMES.index(name) for name in ("trunk", "left leg", "feet", "hands", "head"))
+TRUNK, LEGS, FEET, HANDS, HEAD = (
+    NAMES.index(name) for name in ("trunk", "left leg", "feet", "hands", "head")
+)
 
 SHOULDER_M = 0.75
 """Where sleeves begin on the chart of a cloth: what is across the chest is not on them."""
@@ -103,7 +105,9 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
     share = torch.zeros(len(limb), len(NAMES)).scatter_add_(1, limb, character.weights)
     matrices = world[character.node_of_joint] @ character.joint_from_bind
     vertices = character.posed(matrices).mesh.vertices
-    joints = {part_of[n.name]: world[i, :3, 3].numpy() for i, n in enumerate(character.nodes) if n.name in part_of}
+    joints = {
+        part_of[n.name]: world[i, :3, 3].numpy() for i, n in enumerate(character.nodes) if n.name in part_of
+    }
     return RestBody(vertices, joints, share[character.rest.mesh.faces].sum(1).argmax(1))
 
 
@@ -121,7 +125,9 @@ def find_garments(character: Character, body: RestBody) -> list[Garments | None]
     return [_garments(image, bare, limb, place, body) for image, (limb, place) in zip(lab, maps, strict=True)]
 
 
-def _texels(character: Character, body: RestBody, texture: int, width: int, height: int) -> tuple[Limbs, Image]:
+def _texels(
+    character: Character, body: RestBody, texture: int, width: int, height: int
+) -> tuple[Limbs, Image]:
     """Limb of each texel, -1 where no face shows it, and its place at rest."""
     rest = character.rest
     of_texture = (rest.texture_of_face == texture).nonzero()[:, 0]
@@ -176,11 +182,15 @@ def _centers(values: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "color 
         centers = np.concatenate([centers, values[far][None]])
     for _ in range(2):
         label = _nearest(values, centers)
-        centers = np.stack([values[label == n].mean(0) if (label == n).any() else c for n, c in enumerate(centers)])
+        centers = np.stack(
+            [values[label == n].mean(0) if (label == n).any() else c for n, c in enumerate(centers)]
+        )
     return centers
 
 
-def _nearest(values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "color 3"]) -> Int[np.ndarray, "*any"]:
+def _nearest(
+    values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "color 3"]
+) -> Int[np.ndarray, "*any"]:
     """Which centre is nearest to each value."""
     return (0.5 * (centers**2).sum(1) - values @ centers.T).argmin(-1)
 
@@ -202,7 +212,9 @@ def _garments(
     color = _smooth(lab * cloth[..., None] * np.array([LIGHTNESS, 1, 1], np.float32), 3) / weight[..., None]
     label = _nearest(color, _centers(color[inside][::23]))
     around, along = _unrolled(limb, place, body)
-    below = (limb >= LEGS) | (limb == TRUNK) & (along < float(body.joints["Hips"][1] - body.vertices[:, 1].min()))
+    below = (limb >= LEGS) | (limb == TRUNK) & (
+        along < float(body.joints["Hips"][1] - body.vertices[:, 1].min())
+    )
     covers = []
     dress = []
     shoes = []
@@ -213,7 +225,9 @@ def _garments(
             covers.append((part | margin).astype(np.float32))
             dress.append(n)
             shoes.append(bool((limb[part] == FEET).any()))
-    return Garments(np.stack(covers), shown, bare, around, along, tuple(dress), tuple(shoes)) if covers else None
+    return (
+        Garments(np.stack(covers), shown, bare, around, along, tuple(dress), tuple(shoes)) if covers else None
+    )
 
 
 def _smooth(values: np.ndarray, size: int) -> np.ndarray:
@@ -231,7 +245,11 @@ def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
             continue
         upper, lower = (body.joints.get(part) for part in LIMBS[name][:2])
         top = body.joints["Hips"] if upper is None else upper
-        bottom = top * np.array([1, 0, 1], np.float32) + np.array([0, floor, 0], np.float32) if lower is None else lower
+        bottom = (
+            top * np.array([1, 0, 1], np.float32) + np.array([0, floor, 0], np.float32)
+            if lower is None
+            else lower
+        )
         axis = (top - bottom) / np.linalg.norm(top - bottom)
         front = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
         front /= np.linalg.norm(front)
@@ -256,7 +274,9 @@ _LETTERED = 0.4
 _GRAY = np.array([0.299, 0.587, 0.114], np.float32)
 
 
-def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], variety: float, seed: int) -> Character:
+def vary_cloth(
+    character: Character, upright_from_file: Float[Tensor, "4 4"], variety: float, seed: int
+) -> Character:
     """The character in other clothes; skin, hair and eyes are unchanged.
 
     Each garment is found by its colour, and with a chance of `variety` either dyed (its own pattern in
@@ -266,7 +286,9 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
         ValueError: `variety` is not in [0, 1], or the skeleton is not human.
     """
     if not 0 <= variety <= 1:
-        raise ValueError(f"expected a variety of cloth from 0 to 1, got {variety}; it is the share that changes")
+        raise ValueError(
+            f"expected a variety of cloth from 0 to 1, got {variety}; it is the share that changes"
+        )
     if variety == 0:
         return character
     rng = np.random.default_rng([seed, 31])
@@ -309,7 +331,9 @@ def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -
         new = _dyed(own, rng)
     else:
         color = at_full_size(_colors(garments, n, half, rng))
-        new = np.clip(color * _folds(own, cover[..., 0], at_full_size(garments.shown[half].astype(np.float32))), 0, 1)
+        new = np.clip(
+            color * _folds(own, cover[..., 0], at_full_size(garments.shown[half].astype(np.float32))), 0, 1
+        )
     own += cover * (new - own)
 
 
@@ -338,12 +362,17 @@ def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.ran
     chart = (255 * cloth).astype(np.uint8)
     column = (garments.around_m[window] + CHART.width_m / 2) * CHART.px_per_m - 0.5
     row = (CHART.height_m - garments.along_m[window]) * CHART.px_per_m - 0.5
-    color = cv2.remap(chart, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32) / 255
+    color = (
+        cv2.remap(chart, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32)
+        / 255
+    )
     shown = garments.shown[window]
     part = garments.cover[n][window] > 0
     known = (shown & part).astype(np.float32)
     # Wide enough for the margin of any cover (`MARGIN_PX`).
-    mean = cv2.blur(color * known[..., None], (13, 13)) / np.maximum(cv2.blur(known, (13, 13)), 1e-4)[..., None]
+    mean = (
+        cv2.blur(color * known[..., None], (13, 13)) / np.maximum(cv2.blur(known, (13, 13)), 1e-4)[..., None]
+    )
     return np.where((known > 0)[..., None], color, mean)
 
 

@@ -114,19 +114,27 @@ def read_document(path: Path) -> Document:
         text = data
         binary = b""
     else:
-        raise CaptureError(f"{path}: expected a glTF binary that starts with 'glTF', got {data[:4]!r}; export a .glb")
+        raise CaptureError(
+            f"{path}: expected a glTF binary that starts with 'glTF', got {data[:4]!r}; export a .glb"
+        )
     try:
         document = read_json(text)
     except ValueError as error:
-        raise CaptureError(f"{path}: its JSON part does not parse ({error}); export the file again") from error
+        raise CaptureError(
+            f"{path}: its JSON part does not parse ({error}); export the file again"
+        ) from error
     if not isinstance(document, dict):
         raise CaptureError(f"{path}: expected JSON keys, got a {type(document).__name__}; export it again")
     version = str(document.get("asset", {}).get("version", "none"))
     if not version.startswith("2"):
         raise CaptureError(f"{path}: expected glTF version 2.0, got {version[:40]}; export it as glTF 2.0")
-    needed = [e for e in document.get("extensionsRequired", []) if not e.startswith(("KHR_materials", "KHR_mesh_q"))]
+    needed = [
+        e for e in document.get("extensionsRequired", []) if not e.startswith(("KHR_materials", "KHR_mesh_q"))
+    ]
     if needed:
-        raise CaptureError(f"{path}: needs extensions {shown(needed)}, got no reader; export without compression")
+        raise CaptureError(
+            f"{path}: needs extensions {shown(needed)}, got no reader; export without compression"
+        )
     buffers = tuple(_resource(path, b["uri"]) if "uri" in b else binary for b in document.get("buffers", []))
     return Document(path, document, buffers)
 
@@ -135,7 +143,9 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     """The JSON and the binary chunk of a .glb."""
     length = struct.unpack_from("<I", data, 8)[0] if len(data) >= 12 else 0
     if length < 20 or len(data) < length:
-        raise CaptureError(f"{path}: expected {length} bytes, the file has {len(data)}: it is cut short; copy it again")
+        raise CaptureError(
+            f"{path}: expected {length} bytes, the file has {len(data)}: it is cut short; copy it again"
+        )
     chunks: dict[bytes, bytes] = {}
     offset = 12
     while offset + 8 <= length:
@@ -152,7 +162,9 @@ def _resource(path: Path, uri: str) -> bytes:
         return base64.b64decode(uri.partition(",")[2])
     file = path.parent / unquote(uri)
     if not stays_inside(unquote(uri)) or not file.resolve().is_relative_to(path.parent.resolve()):
-        raise CaptureError(f"{path}: expected files in its own folder, got '{uri[:200]}'; move the file there")
+        raise CaptureError(
+            f"{path}: expected files in its own folder, got '{uri[:200]}'; move the file there"
+        )
     return _read(file)
 
 
@@ -164,7 +176,9 @@ def _count(value: object) -> int:
 
 def _read(path: Path) -> bytes:
     if path.exists() and not (path.is_file() and path.stat().st_size <= MAX_BYTES):
-        raise CaptureError(f"{path}: expected a file of at most {MAX_BYTES // 10**6} MB, got another; check the path")
+        raise CaptureError(
+            f"{path}: expected a file of at most {MAX_BYTES // 10**6} MB, got another; check the path"
+        )
     try:
         return path.read_bytes()
     except OSError as error:
@@ -269,7 +283,9 @@ def _node(document: Document, index: int, parent: int) -> Node:
         translation = matrix[:3, 3].clone()
         scale = matrix[:3, :3].norm(dim=0)
         if not bool((scale > 0).all()):
-            raise CaptureError(f"{document.path}: node {name} has a singular matrix; apply transforms and export again")
+            raise CaptureError(
+                f"{document.path}: node {name} has a singular matrix; apply transforms and export again"
+            )
         rotation = matrix[:3, :3] / scale
     else:
         rest = {"translation": [0, 0, 0], "scale": [1, 1, 1], "rotation": [0, 0, 0, 1]}
@@ -310,8 +326,12 @@ class _Parts:
         vertices = read(attributes["POSITION"]).astype(np.float32)
         n = len(vertices)
         if self.count + n > MAX_VERTICES:
-            raise CaptureError(f"{self.document.path}: expected at most {MAX_VERTICES} vertices, got more; simplify it")
-        faces = (read(primitive["indices"]).reshape(-1) if "indices" in primitive else np.arange(n)).astype(np.int64)
+            raise CaptureError(
+                f"{self.document.path}: expected at most {MAX_VERTICES} vertices, got more; simplify it"
+            )
+        faces = (read(primitive["indices"]).reshape(-1) if "indices" in primitive else np.arange(n)).astype(
+            np.int64
+        )
         if len(faces) % 3 or (len(faces) and faces.max() >= n):
             got = f"an index list of {len(faces)} up to {faces.max(initial=0)}"
             raise self.document.fault(f"expected triangles whose corners are below {n}, got {got}")
@@ -326,7 +346,9 @@ class _Parts:
         if material not in self.textures:
             self.textures[material] = self.document.base_color(material)
         texture = np.full(len(faces), list(self.textures).index(material))
-        for column, values in zip(self.columns, (vertices, normals, uv, weights, joints, texture), strict=True):
+        for column, values in zip(
+            self.columns, (vertices, normals, uv, weights, joints, texture), strict=True
+        ):
             column.append(values)
         self.faces.append(faces + self.count)
         self.count += n
@@ -355,7 +377,11 @@ class _Parts:
         """Position of a skin's or a node's first joint; `binds` is the accessor of their inverse bind matrices."""
         if key not in self.first_joint:
             identity = np.tile(np.eye(4, dtype=np.float32), (len(nodes), 1, 1))
-            given = identity if binds is None else self.document.accessor(binds).reshape(-1, 4, 4).transpose(0, 2, 1)
+            given = (
+                identity
+                if binds is None
+                else self.document.accessor(binds).reshape(-1, 4, 4).transpose(0, 2, 1)
+            )
             missing = [n for n in nodes if n not in self.position]
             if missing:
                 raise self.document.fault(f"joints {missing} are not in the scene")
@@ -371,7 +397,9 @@ class _Parts:
             return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
         vertices, normals, uv, weights = (floats(np.concatenate(column)) for column in self.columns[:4])
-        joints, texture = (torch.from_numpy(np.concatenate(column).astype(np.int64)) for column in self.columns[4:])
+        joints, texture = (
+            torch.from_numpy(np.concatenate(column).astype(np.int64)) for column in self.columns[4:]
+        )
         mesh = Mesh(vertices, torch.from_numpy(np.concatenate(self.faces)))
         textures = tuple(floats(t) for t in self.textures.values())
         rest = TexturedMesh(mesh, torch.nn.functional.normalize(normals, dim=-1), uv, texture, textures)

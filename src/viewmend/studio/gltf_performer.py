@@ -33,7 +33,12 @@ class GltfPerformer:
     """
 
     def __init__(
-        self, character: Path, motion: Path, seed: int = 0, duration_s: float = 2.0, cloth_variety: float = 0.0
+        self,
+        character: Path,
+        motion: Path,
+        seed: int = 0,
+        duration_s: float = 2.0,
+        cloth_variety: float = 0.0,
     ) -> None:
         """Load both files; `cloth_variety` is the share of the character's garments that the seed changes.
 

@@ -156,7 +156,12 @@ def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfecti
     encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, it.jpeg_quality])[1]
     decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
     assert decoded is not None, "what was just encoded decodes"
-    return torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1])).permute(2, 0, 1).contiguous().to(rgb.device)
+    return (
+        torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1]))
+        .permute(2, 0, 1)
+        .contiguous()
+        .to(rgb.device)
+    )
 
 
 def _stained(rgb: Picture, mask: Mask, background: Backdrop, strength: float) -> Picture:
@@ -246,4 +251,6 @@ def _blurred(value: Float[Tensor, "height width"], sigma_px: float) -> Float[Ten
 
 def _generator(*key: int) -> torch.Generator:
     """Random numbers that depend on the key alone: capture seed, purpose, camera, time."""
-    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
+    return torch.Generator().manual_seed(
+        int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1)
+    )

@@ -59,7 +59,9 @@ class BoundMesh:
         """
         rows = world_from_bind[:, :3].reshape(-1, 12)
         # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.
-        bags = torch.nn.functional.embedding_bag(self.joints.long(), rows, per_sample_weights=self.weights, mode="sum")
+        bags = torch.nn.functional.embedding_bag(
+            self.joints.long(), rows, per_sample_weights=self.weights, mode="sum"
+        )
         a, b, c, moved = bags.unflatten(1, (3, 4)).unbind(-1)
 
         def turned(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
@@ -67,7 +69,9 @@ class BoundMesh:
             return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
 
         mesh = Mesh(turned(self.rest.mesh.vertices) + moved, self.rest.mesh.faces)
-        return replace(self.rest, mesh=mesh, normals=torch.nn.functional.normalize(turned(self.rest.normals), dim=-1))
+        return replace(
+            self.rest, mesh=mesh, normals=torch.nn.functional.normalize(turned(self.rest.normals), dim=-1)
+        )
 
 
 @dataclass(frozen=True)

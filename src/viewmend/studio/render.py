@@ -71,11 +71,16 @@ def stage_lights(seed: int) -> Lights:
     heading = torch.arange(16) * math.pi / 8
     walls = torch.stack([heading.cos(), torch.zeros(16), heading.sin()], -1)
     facing = (walls @ toward.T).clamp(min=0)
-    parts = [share * part / (facing @ part).mean() for share, part in ((EVENNESS, surrounding), (1 - EVENNESS, lobes))]
+    parts = [
+        share * part / (facing @ part).mean()
+        for share, part in ((EVENNESS, surrounding), (1 - EVENNESS, lobes))
+    ]
     return Lights(toward, 0.95 * (parts[0] + parts[1]), lamps, 0.05 * power)
 
 
-def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex light"]:
+def visibility(
+    mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights
+) -> Float[Tensor, "vertex light"]:
     """How much of each direction the mesh leaves free at its vertices, 0 to 1.
 
     One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
@@ -192,7 +197,9 @@ def render(
     return MultiViewFrame(cameras, rgb, mask, 0, depth)
 
 
-def render_masks(mesh: Mesh, cameras: Cameras, samples_per_side: int = 2) -> UInt8[Tensor, "view height width"]:
+def render_masks(
+    mesh: Mesh, cameras: Cameras, samples_per_side: int = 2
+) -> UInt8[Tensor, "view height width"]:
     """The masks that `render` draws, without shading."""
     covered = rasterize(mesh, _enlarged(cameras, samples_per_side)).triangle >= 0
     share = avg_pool2d(covered[:, None].float(), samples_per_side)[:, 0]

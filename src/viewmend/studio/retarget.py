@@ -17,7 +17,10 @@ TRUNK = ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")
 PARTS = (*TRUNK, *(side + part for side in ("Left", "Right") for part in SIDED))
 """Parts of a body, parents before children: named as in HumanIK and Mixamo; Spine2 carries the collars."""
 
-REQUIRED = ("Hips", *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")))
+REQUIRED = (
+    "Hips",
+    *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")),
+)
 
 _LEFT = " ".join("Left" + part for part in SIDED)
 _FAMILIES = {
@@ -57,7 +60,21 @@ _WORDS = (
     ("Shoulder", ("clavicle", "collar", "shoulder")),
 )
 _SIDE = re.compile(r"(?:^|[^a-z])(left|right|[lr])(?:[^a-z]|$)|^(left|right)|(left|right)$")
-_SKIP = ("twist", "roll", "end", "nub", "thumb", "index", "middle", "ring", "pinky", "little", "finger", "helper", "ik")
+_SKIP = (
+    "twist",
+    "roll",
+    "end",
+    "nub",
+    "thumb",
+    "index",
+    "middle",
+    "ring",
+    "pinky",
+    "little",
+    "finger",
+    "helper",
+    "ik",
+)
 
 
 def family_table(family: str) -> dict[str, str]:
@@ -81,7 +98,9 @@ def find_parts(names: Sequence[str]) -> dict[str, str]:
     """
     best: dict[str, str] = {}
     # What stands before the hips' name where joints have a namespace.
-    found = {m.group(1) for name in names if (m := re.match(r"^(.+?[:_|.\- ])(?:hips|pelvis|root)$", name, re.I))}
+    found = {
+        m.group(1) for name in names if (m := re.match(r"^(.+?[:_|.\- ])(?:hips|pelvis|root)$", name, re.I))
+    }
     for prefix in ("", *sorted(found)):
         plain = {name[len(prefix) :].lower(): name for name in reversed(names) if name.startswith(prefix)}
         for family in _FAMILIES:
@@ -174,7 +193,9 @@ class Retarget:
         fraction = frame - before
         turns = _orthonormal(torch.lerp(self.rotations[before], self.rotations[after], fraction))
         position = torch.lerp(self.hips_path[before], self.hips_path[after], fraction)
-        world = node_matrices(self.character, self.upright_from_file, self.driver, turns, (self.hips, position))
+        world = node_matrices(
+            self.character, self.upright_from_file, self.driver, turns, (self.hips, position)
+        )
         return world[self.character.node_of_joint] @ self.character.joint_from_bind
 
 
@@ -252,7 +273,9 @@ def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
         axis[n] = v[n].sign()
         return axis
 
-    up = nearest_axis((rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2)
+    up = nearest_axis(
+        (rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2
+    )
     left = rest["LeftUpLeg"] - rest["RightUpLeg"]
     side = nearest_axis(left - (left @ up) * up)
     return torch.stack([side, up, torch.linalg.cross(side, up)])

@@ -51,7 +51,9 @@ def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0
     y = low + (high - low) * (torch.arange(_positive(count)) + 0.5) / count
     angle = torch.arange(count) * math.pi * (3 - math.sqrt(5))
     around = (1 - y * y).sqrt()
-    eyes = RADIUS_M * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(SUBJECT_CENTER_M)
+    eyes = RADIUS_M * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(
+        SUBJECT_CENTER_M
+    )
     return _stand(eyes, size_px, seed)
 
 
@@ -81,7 +83,9 @@ def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], seed: int) -
         eye = eye + 0.04 * off[n, 0]
         pose = look_at(eye, center + 0.02 * off[n, 1], up)
         pose[:3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, 0.01 * float(off[n, 2, 0])])) @ pose[:3]
-        fov = fov_y_showing(size_px, VISIBLE_M, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1])))
+        fov = fov_y_showing(
+            size_px, VISIBLE_M, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1]))
+        )
         views.append(pinhole(fov, *size_px, pose, f"cam{n:02d}"))
     return concatenate_cameras(views)
 

@@ -149,7 +149,9 @@ class Studio:
             IndexError: `time` is not in the capture.
         """
         self._check_time(time)
-        masks = render_masks(self.scene(time).mesh, self.true_cameras.select(names), self.config.samples_per_side)
+        masks = render_masks(
+            self.scene(time).mesh, self.true_cameras.select(names), self.config.samples_per_side
+        )
         numbers = self._numbers(names)
         masks = imperfect_masks(masks, self.config.imperfections, self._error_seed, time, numbers)
         return Silhouettes(masks, self.cameras.select(names))
@@ -176,7 +178,9 @@ class Studio:
         straight = srgb_from_linear((linear_from_srgb(frame.rgb.float() / 255) / share).clamp(0, 1))
         return replace(frame, rgb=(255 * straight).round().to(torch.uint8))
 
-    def _draw(self, cameras: Cameras, time: int, behind: Float[Tensor, "view 3 height width"] | None) -> MultiViewFrame:
+    def _draw(
+        self, cameras: Cameras, time: int, behind: Float[Tensor, "view 3 height width"] | None
+    ) -> MultiViewFrame:
         return replace(render(self._surface(time), cameras, behind, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
@@ -213,5 +217,7 @@ def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -
     files = sorted(f for f in place.iterdir() if f.suffix.lower() in suffixes) if place.is_dir() else []
     if not files:
         found = "no such files in it" if place.is_dir() else "no such folder or file"
-        raise CaptureError(f"{place}: expected a {' or '.join(suffixes)} file or a folder of them, found {found}")
+        raise CaptureError(
+            f"{place}: expected a {' or '.join(suffixes)} file or a folder of them, found {found}"
+        )
     return files[int(chance.integers(len(files)))]

@@ -49,9 +49,12 @@ class Discriminator(nn.Module):
             # The first is padded by 1 in every dimension, as in the published network.
             padding = [(1, 1, 1), *[(1, 2, 2)] * last]
             convolutions = [
-                nn.Conv3d(C[i], C[i + 1], (3, 5, 5), (1, 2, 2), padding[i], bias=i == last) for i in range(layers)
+                nn.Conv3d(C[i], C[i + 1], (3, 5, 5), (1, 2, 2), padding[i], bias=i == last)
+                for i in range(layers)
             ]
-        self.convolutions = nn.ModuleList([*(spectral_norm(layer) for layer in convolutions[:-1]), convolutions[-1]])
+        self.convolutions = nn.ModuleList(
+            [*(spectral_norm(layer) for layer in convolutions[:-1]), convolutions[-1]]
+        )
 
     def forward(self, images: Sequence[Float[Tensor, "3 ... _h _w"]]) -> list[Float[Tensor, "logit ..."]]:
         """Logits of images, or of clips of any length, with values in [0, 1]; ValueError below 3 x 3 pixels.
@@ -109,7 +112,9 @@ class Judged:
     """E, without the channel axis."""
 
 
-def discriminator_objective(net: Discriminator, batch: Judged, loss: AdversarialLoss = GAN) -> Float[Tensor, ""]:
+def discriminator_objective(
+    net: Discriminator, batch: Judged, loss: AdversarialLoss = GAN
+) -> Float[Tensor, ""]:
     """The discriminator's loss; no gradient reaches the inpainter."""
     logits = [own.float() for own in net([*batch.truth, *(image.detach() for image in batch.completed)])]
     pairs = zip(logits[: len(batch.truth)], logits[len(batch.truth) :], strict=True)
@@ -132,7 +137,9 @@ def _mean(losses: list[Tensor], batch: Judged) -> Float[Tensor, ""]:
 class Adversary:
     """A discriminator with its loss and optimiser, trained alongside the model."""
 
-    def __init__(self, net: Discriminator, loss: AdversarialLoss, weight: float, learning_rate: float) -> None:
+    def __init__(
+        self, net: Discriminator, loss: AdversarialLoss, weight: float, learning_rate: float
+    ) -> None:
         """`weight` is lambda_adv, the weight of the loss in the model's total."""
         self.discriminator = net
         self.loss = loss

@@ -178,9 +178,17 @@ class TrainConfig:
     def __post_init__(self) -> None:
         least = {"steps": 1, "batch": 1, "streams": 1, "new_per_batch": 1, "workers": 0, "validate_every": 0}
         least |= {"checkpoint_minutes": 0}
-        wrong = [f"{name} of {getattr(self, name)}" for name, low in least.items() if not getattr(self, name) >= low]
+        wrong = [
+            f"{name} of {getattr(self, name)}"
+            for name, low in least.items()
+            if not getattr(self, name) >= low
+        ]
         wrong += [f"minutes of {self.minutes}"] if self.minutes is not None and not self.minutes > 0 else []
-        wrong += [f"microbatch of {self.microbatch}"] if self.microbatch is not None and self.microbatch < 1 else []
+        wrong += (
+            [f"microbatch of {self.microbatch}"]
+            if self.microbatch is not None and self.microbatch < 1
+            else []
+        )
         wrong += [] if 0 < self.learning_rate < math.inf else [f"learning_rate of {self.learning_rate}"]
         if wrong:
             raise ValueError(

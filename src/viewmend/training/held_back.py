@@ -67,7 +67,9 @@ class HeldBack:
         if camera is None:
             return cls(None, first_frame)
         if camera != AUTO and camera not in names:
-            raise CaptureError(f"{capture.name}: expected --hold-out among {', '.join(names)}, got '{camera}'")
+            raise CaptureError(
+                f"{capture.name}: expected --hold-out among {', '.join(names)}, got '{camera}'"
+            )
         if camera != AUTO and len(names) < MIN_CAMERAS:
             raise CaptureError(
                 f"{capture.name}: expected at least {MIN_CAMERAS} cameras to hold one back, got {len(names)}; omit "
@@ -123,7 +125,9 @@ class HeldBackView:
         rgb = composite(background, completed.rgb, completed.opacity)
         truth = camera_image(self.truth, background)
         found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
-        assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
+        assert found is not None and self.truth.mask is not None, (
+            "images have pixels, and captures masks here"
+        )
         box = _subject_box(self.truth.mask[0])
         distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
         return ViewScore(self.camera, self.trained_on, found, distance), completed
@@ -146,7 +150,9 @@ def _subject_box(mask: Tensor) -> tuple[slice, slice]:
     box = []
     for axis, length in enumerate(mask.shape):
         own = (mask > 127).any(1 - axis).nonzero()[:, 0]
-        first, last = (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
+        first, last = (
+            (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
+        )
         short = max(0, MIN_PX["alex"] - (last - first))
         first = first - (short + 1) // 2
         last = last + (short + 1) // 2
@@ -191,7 +197,9 @@ def _views_of(capture: CaptureFolder, own: HeldBack, table: bool) -> Iterator[He
             continue
         seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
-        yield HeldBackView(camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth)
+        yield HeldBackView(
+            camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth
+        )
 
 
 def _time_with_subject(capture: CaptureFolder, late: range) -> int:
@@ -230,7 +238,9 @@ class HeldBackValidation:
         made = [view.score(model, self._metric) for view in self._views]
         model.train(training)  # pyright: ignore
         background = model.background or "black"
-        rows = [_row(view, [("tuned", own)], background) for view, (_, own) in zip(self._views, made, strict=True)]
+        rows = [
+            _row(view, [("tuned", own)], background) for view, (_, own) in zip(self._views, made, strict=True)
+        ]
         write_image(image, contact_sheet(rows[:4], *TILE_PX))
         psnr_db, lpips = (sum(getattr(s, name) for s, _ in made) / len(made) for name in ("psnr_db", "lpips"))
         return {"psnr_whole": psnr_db, "lpips_subject": lpips, "score": psnr_db - LPIPS_DB * lpips}
@@ -253,7 +263,9 @@ def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, she
     return "\n".join(lines)
 
 
-def _row(view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background) -> list[Tile]:
+def _row(
+    view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background
+) -> list[Tile]:
     """The view as rendered, as completed, and the truth, cut to the subject."""
     box = _subject_box(view.truth.mask[0])  # pyright: ignore[reportOptionalSubscript]
     images = [("rendered", completed[0][1].view.rgb), *((name, own.rgb) for name, own in completed)]

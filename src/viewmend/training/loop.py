@@ -253,13 +253,19 @@ class Run:
         clock = RunClock(self.config, self.state.step, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
             step = first = self.state.step
-            if step == 0 and self.validation is not None and (self.keeps_best or self.objective.compares_seen):
+            if (
+                step == 0
+                and self.validation is not None
+                and (self.keeps_best or self.objective.compares_seen)
+            ):
                 # The weights that the run starts from are kept if none are better, and later gains are over theirs.
                 self._validate(log, step)
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
                 # A checkpoint that is older than the best weights would let worse ones replace them.
-                due = step > self.state.step and (clock.checkpoint_due() or self.state.best_step > self.state.step)
+                due = step > self.state.step and (
+                    clock.checkpoint_due() or self.state.best_step > self.state.step
+                )
                 progress, due = self.own.maximum(progress, float(due))
                 if due:
                     self._save(step, clock)
@@ -267,7 +273,9 @@ class Run:
                     break
                 with clock.waiting():
                     batches = [stream.batch(step, config.batch) for stream in self.streams]
-                rate = config.learning_rate * self.objective.learning_rate_factor(step, progress, config.warmup)
+                rate = config.learning_rate * self.objective.learning_rate_factor(
+                    step, progress, config.warmup
+                )
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
                 losses = self._step(step, batches)
@@ -375,7 +383,9 @@ class Run:
         folder.mkdir(exist_ok=True)
         for number, sample in enumerate(batch):
             data = sample_to_bytes(sample)
-            write_atomically(folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data))
+            write_atomically(
+                folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data)
+            )
         raise FloatingPointError(
             f"expected a finite loss, got {float(total)} at step {step}; inspect its batch in {folder}, or lower the "
             "learning rate and resume from the last checkpoint"
@@ -400,7 +410,9 @@ class Run:
             seed = f"{config.seed}/{number}"
             at = self.state.positions[number] if self.state.positions else None
             scenes = self.objective.training_scenes(seed)
-            streams.append(SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, at))
+            streams.append(
+                SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, at)
+            )
         return streams
 
     def _save(self, step: int, clock: RunClock) -> None:
@@ -414,7 +426,9 @@ class Run:
 
     def _write_model(self, step: int | None = None) -> None:
         state = self.state if step is None else replace(self.state, step=step)
-        self.objective.save(self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary))
+        self.objective.save(
+            self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary)
+        )
 
 
 def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:

@@ -125,7 +125,11 @@ def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", option
     own = model.state_dict()
     found = start.state_dict()
     own = {name: weight for name, weight in own.items() if not (kept and name.startswith(kept))}
-    fitting = {name: found[name] for name, weight in own.items() if name in found and found[name].shape == weight.shape}
+    fitting = {
+        name: found[name]
+        for name, weight in own.items()
+        if name in found and found[name].shape == weight.shape
+    }
     missing = [name for name in own if name not in fitting and not (optional and name.startswith(optional))]
     if missing:
         raise ValueError(
@@ -136,7 +140,11 @@ def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", option
 
 
 def image_loss(
-    predicted: Images, counted: Planes, error: Planes, truth: Images, channels: Literal["mean", "sum"] = "mean"
+    predicted: Images,
+    counted: Planes,
+    error: Planes,
+    truth: Images,
+    channels: Literal["mean", "sum"] = "mean",
 ) -> ImageLoss:
     """The mean losses of a batch of images of any sizes: of Ftilde, given E, and F* on the same background.
 
@@ -148,11 +156,15 @@ def image_loss(
         off = image.float() - target
         l1 = off.abs().sum(0) if channels == "sum" else off.abs().mean(0)
         inside, outside = (_weighted_mean(l1, weight) for weight in (E, (1 - E) * (included > 0)))
-        losses.append(ImageLoss(inside, outside, (_weighted_mean(off.square().mean(0), E) + MIN_SQUARE).log10()))
+        losses.append(
+            ImageLoss(inside, outside, (_weighted_mean(off.square().mean(0), E) + MIN_SQUARE).log10())
+        )
     return mean_loss(losses)
 
 
-def _weighted_mean(values: Float[Tensor, "height width"], weight: Float[Tensor, "height width"]) -> Float[Tensor, ""]:
+def _weighted_mean(
+    values: Float[Tensor, "height width"], weight: Float[Tensor, "height width"]
+) -> Float[Tensor, ""]:
     """0 if the weight is 0 everywhere."""
     return (weight * values).sum() / weight.sum().clamp_min(1e-6)
 
@@ -166,7 +178,9 @@ def mean_loss(losses: Sequence[ImageLoss]) -> ImageLoss:
 def write_rows(rows: Images, path: Path) -> None:
     """Write the first rows of input, output and ground truth as one image, all scaled to one size."""
     size = (TILE_PX, 3 * TILE_PX)
-    scaled = [F.interpolate(row[None], size, mode="bilinear", antialias=True)[0] for row in rows[:SHOWN_VIEWS]]
+    scaled = [
+        F.interpolate(row[None], size, mode="bilinear", antialias=True)[0] for row in rows[:SHOWN_VIEWS]
+    ]
     image = (torch.cat(scaled, 1).clamp(0, 1) * 255).round().to(torch.uint8)
     write_image(path, image.permute(1, 2, 0).contiguous().numpy())
 
@@ -205,14 +219,18 @@ class HoleValidation:
         write_rows(rows, image)
         return scores
 
-    def _score(self, model: nn.Module, sample: Sample, rows: list[Tensor]) -> tuple[float | None, float | None]:
+    def _score(
+        self, model: nn.Module, sample: Sample, rows: list[Tensor]
+    ) -> tuple[float | None, float | None]:
         """PSNR in the holes of the model and of Telea; appends a row of images."""
         device = next(model.parameters()).device
         truth = true_image(sample, self.background)
         holes = sample.view.missing > 0
         completed = self.complete(model, to_device(sample, device)).float().clamp(0, 1).cpu()
         telea = Telea()
-        filled, _ = telea.step_on(self.background, sample.view, ContextProvider(lambda *_: None), telea.initial_state())
+        filled, _ = telea.step_on(
+            self.background, sample.view, ContextProvider(lambda *_: None), telea.initial_state()
+        )
         classical = composite(self.background, filled.rgb, filled.opacity)
         rows.append(torch.cat([sample.view.rgb, completed, truth], 2))
         return psnr(completed, truth, holes), psnr(classical, truth, holes)

@@ -13,7 +13,14 @@ from viewmend.models.paper.config import paper as paper_model
 from viewmend.models.paper.patch_transformer import PatchTransformer, Prediction
 from viewmend.training.adversarial import GAN, Adversary, Discriminator, Judged
 from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
-from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, image_loss, load_start
+from viewmend.training.objective import (
+    HoleValidation,
+    ImageLoss,
+    Objective,
+    StepOutput,
+    image_loss,
+    load_start,
+)
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
 from viewmend.training.shared_rigs import SharedRigScenes
@@ -22,7 +29,11 @@ from viewmend.utils.options import HIDDEN, NEGATED
 WINDOW = (0, 10, 20, 27, 28, 29, 30)
 """The paper's temporal window of frame 30: t, t - 1, t - 2, t - 3, t - 10, t - 20 and t - 30."""
 SAMPLING = SamplingConfig(
-    frames=WINDOW, min_history=len(WINDOW) - 1, with_context=True, num_source_views=(3,), source_view_weights=(1,)
+    frames=WINDOW,
+    min_history=len(WINDOW) - 1,
+    with_context=True,
+    num_source_views=(3,),
+    source_view_weights=(1,),
 )
 """Samples with three source views and a complete window."""
 
@@ -38,7 +49,9 @@ class PaperObjective(Objective[PatchTransformer]):
         self.loss_summary = "L1 inside and outside the holes (section 8)"
         if options.adversarial:
             self.loss_summary += f", {options.adversarial:g} x adversarial"
-            self.adversary = Adversary(Discriminator("image"), GAN, options.adversarial, options.discriminator_rate)
+            self.adversary = Adversary(
+                Discriminator("image"), GAN, options.adversarial, options.discriminator_rate
+            )
         self.validation = HoleValidation(
             unseen_scenes(config.scenes, options.sampling),
             config.validation_views,
@@ -55,7 +68,10 @@ class PaperObjective(Objective[PatchTransformer]):
         truth = [true_image(s, self.model.config.background) for s in batch]
         missing = [s.view.missing for s in batch]
         masks = [s.view.target_mask for s in batch]
-        inside = [torch.ones_like(s.view.mask) if mask is None else mask for s, mask in zip(batch, masks, strict=True)]
+        inside = [
+            torch.ones_like(s.view.mask) if mask is None else mask
+            for s, mask in zip(batch, masks, strict=True)
+        ]
         image = paper_image_loss(predictions, missing, truth, inside)
         judged = Judged(truth, [p.composited.float() for p in predictions], missing)
         return StepOutput(image, image.inside + image.outside, judged)
@@ -98,7 +114,9 @@ def paper_image_loss(
 ) -> ImageLoss:
     """L_in and L_out with channels summed, over all pixels or those `counted`; Ftilde is the view without patches."""
     made = [torch.where(p.coverage > 0, p.inpainted, p.composited.detach()) for p in predictions]
-    return image_loss(made, counted or [torch.ones_like(p.coverage) for p in predictions], error, truth, "sum")
+    return image_loss(
+        made, counted or [torch.ones_like(p.coverage) for p in predictions], error, truth, "sum"
+    )
 
 
 def _complete(model: nn.Module, sample: Sample) -> Float[Tensor, "3 height width"]:

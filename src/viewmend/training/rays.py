@@ -135,7 +135,9 @@ def pixel_loss(predicted: Float[Tensor, "pixel 3"], truth: Float[Tensor, "pixel 
         zero = predicted.sum()
         return ImageLoss(zero, zero, zero)
     squares = (predicted - truth).square().mean()
-    return ImageLoss((predicted - truth).abs().mean(), torch.zeros_like(squares), (squares + MIN_SQUARE).log10())
+    return ImageLoss(
+        (predicted - truth).abs().mean(), torch.zeros_like(squares), (squares + MIN_SQUARE).log10()
+    )
 
 
 def _complete(model: nn.Module, sample: Sample) -> Float[Tensor, "3 height width"]:

@@ -58,7 +58,9 @@ class SampleReplay(Generic[Item]):
         """The batch of `step`, to be called for consecutive steps; smaller than `size` until the buffer has filled."""
         num_new = min(self.new_per_batch, size)
         num_replayed = min(size - num_new, len(self._buffer))
-        replayed = Random(f"{self.seed}/{step}").sample([sample for _, _, sample in self._buffer], num_replayed)
+        replayed = Random(f"{self.seed}/{step}").sample(
+            [sample for _, _, sample in self._buffer], num_replayed
+        )
         new = [next(self._new) for _ in range(num_new)]
         self._buffer.extend(new)
         return [sample for _, _, sample in new] + replayed

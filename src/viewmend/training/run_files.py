@@ -20,7 +20,15 @@ FILE = "run.safetensors"
 """The last checkpoint has this name."""
 PREVIOUS = "run.previous.safetensors"
 """The checkpoint before the last has this name."""
-MAY_CHANGE = ("steps", "minutes", "workers", "microbatch", "checkpoint_minutes", "validate_every", "validation_views")
+MAY_CHANGE = (
+    "steps",
+    "minutes",
+    "workers",
+    "microbatch",
+    "checkpoint_minutes",
+    "validate_every",
+    "validation_views",
+)
 """Fields of the config that may differ when a run is resumed."""
 
 
@@ -64,7 +72,11 @@ class Progress:
 
 
 def save_run(
-    folder: Path, config: TrainConfig, state: RunState, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
+    folder: Path,
+    config: TrainConfig,
+    state: RunState,
+    modules: dict[str, nn.Module],
+    optimizers: dict[str, Optimizer],
 ) -> None:
     """Write a checkpoint; the one that was there becomes the previous one."""
     tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
@@ -95,8 +107,18 @@ def load_run(
         stored = json.loads(metadata["config"])
         own = _flat(config)
         values = json.loads(metadata["state"])
-        different = [key for key in {**own, **stored} if key not in MAY_CHANGE and own.get(key) != stored.get(key)]
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        different = [
+            key for key in {**own, **stored} if key not in MAY_CHANGE and own.get(key) != stored.get(key)
+        ]
+    except (
+        OSError,
+        SafetensorError,
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise RunError(f"{path}: expected a run to resume, got {error}; {_advice(path)}") from error
     if different:
         raise RunError(
@@ -120,7 +142,9 @@ def load_run(
 
 def _advice(path: Path) -> str:
     if path.name == FILE and path.with_name(PREVIOUS).exists():
-        return f"remove the file to start again, or rename {PREVIOUS} to it to resume from the checkpoint before"
+        return (
+            f"remove the file to start again, or rename {PREVIOUS} to it to resume from the checkpoint before"
+        )
     return "remove the file to start again"
 
 
@@ -136,7 +160,9 @@ def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
         states.setdefault(int(number), {})[key] = value
     groups = optimizer.state_dict()["param_groups"]
     count = sum(len(group["params"]) for group in groups)
-    if states and (set(states) != set(range(count)) or len({frozenset(state) for state in states.values()}) > 1):
+    if states and (
+        set(states) != set(range(count)) or len({frozenset(state) for state in states.values()}) > 1
+    ):
         raise ValueError(f"moments of {len(states)} parameters for {count}")
     optimizer.load_state_dict({"state": states, "param_groups": groups})
 
@@ -225,7 +251,11 @@ def _is_later(line: str, step: int) -> bool:
 
 def model_card(config: TrainConfig, state: RunState, loss_summary: str) -> str:
     """The README.md of trained weights, in Markdown: how they were trained; scores are added by hand."""
-    hardware = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{torch.get_num_threads()} CPU threads"
+    hardware = (
+        torch.cuda.get_device_name()
+        if torch.cuda.is_available()
+        else f"{torch.get_num_threads()} CPU threads"
+    )
     averaged = "; averaged weights" if config.ema else ""
     start = "random weights" if config.start is None else f"`{config.start}`"
     return f"""# {config.name}

@@ -79,12 +79,19 @@ class HeldOutCamera:
         return self.stream.add_frame(self.rig.inputs(self.held, time), carving=carving)
 
     def sample(
-        self, time: int, times: Sequence[int], render: RenderConfig, sampling: SamplingConfig, min_hole_px: int = 0
+        self,
+        time: int,
+        times: Sequence[int],
+        render: RenderConfig,
+        sampling: SamplingConfig,
+        min_hole_px: int = 0,
     ) -> Sample | None:
         """The sample at frame `time` with context of `times`, its own first; None if its holes are too small."""
         now = self.frame(time)
         target = self.rig.calibration(self.held, time).select([self.held])
-        known = None if self.protocol == "strict" else self.rig.truth(self.held, time)  # rendered only if needed
+        known = (
+            None if self.protocol == "strict" else self.rig.truth(self.held, time)
+        )  # rendered only if needed
         target_mask, _ = revealed(self.protocol, known)
         view = self.stream.with_render_config(render).render(target, time, target_mask=target_mask)
         if float(view.missing.sum()) < min_hole_px:
@@ -99,7 +106,11 @@ class HeldOutCamera:
 
 
 def rig_samples(
-    rig: LeaveOneOut, scenes: SceneConfig, sampling: SamplingConfig, random: Random, held_out: str | None = None
+    rig: LeaveOneOut,
+    scenes: SceneConfig,
+    sampling: SamplingConfig,
+    random: Random,
+    held_out: str | None = None,
 ) -> list[Sample]:
     """Hold out some cameras of a rig in turn (or only `held_out`), each at some frames; ValueError if too few."""
     times = sorted(rig.frames)
@@ -120,7 +131,9 @@ def rig_samples(
             sample = None
             for time in range(end - sampling.clip_length + 1, end + 1):
                 context = tuple(t for t in reversed(times) if t <= time) if sampling.with_context else ()
-                new = others.sample(time, context, render, sampling, sampling.min_hole_px if time == end else 0)
+                new = others.sample(
+                    time, context, render, sampling, sampling.min_hole_px if time == end else 0
+                )
                 sample = new and replace(new, previous=sample)
             if sample is not None:
                 samples.append(sample)

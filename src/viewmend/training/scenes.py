@@ -45,7 +45,9 @@ class RigSource(Protocol):
 class StudioRigs:
     """Rigs of the synthetic studio, rendered on request."""
 
-    def __init__(self, config: SceneConfig, frames: Sequence[int], seed: str, split: Split = "training") -> None:
+    def __init__(
+        self, config: SceneConfig, frames: Sequence[int], seed: str, split: Split = "training"
+    ) -> None:
         """`seed` determines everything random except the people, whose seeds belong to the split.
 
         Raises ValueError if the split, or the config's characters or motions, are reserved for tests.
@@ -78,7 +80,9 @@ def training_people(config: SceneConfig, split: Split) -> SceneConfig:
     return config if recordings(split, people) else replace(config, performers=None, motions=None)
 
 
-def random_studio(config: SceneConfig, frames: int, random: Random, split: Split = "training") -> StudioConfig:
+def random_studio(
+    config: SceneConfig, frames: int, random: Random, split: Split = "training"
+) -> StudioConfig:
     """A studio with random people, rig and imperfections, distributed as real studios differ."""
     flawed = random.random() < config.imperfect_fraction
     strength = random.random() if flawed else 0.0
@@ -110,7 +114,11 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
         it = replace(it, calibration_px=factor * it.calibration_px, calibration_m=factor * it.calibration_m)
         it = replace(it, mask_edge_px=random.uniform(1, HARD_MASKS) * it.mask_edge_px)
         studio = replace(studio, imperfections=it)
-    if config.performers is not None and config.motions is not None and random.random() < config.performers_fraction:
+    if (
+        config.performers is not None
+        and config.motions is not None
+        and random.random() < config.performers_fraction
+    ):
         variety = random.uniform(0.0, 1.0)
         studio = replace(studio, performers=config.performers, motions=config.motions, cloth_variety=variety)
     return studio
@@ -143,7 +151,9 @@ class CaptureRigs:
         if own is not None and own.camera is not None:
             frames = {time: frame.without([own.camera]) for time, frame in frames.items()}
         # A camera without an image at some of these frames cannot be held out there.
-        complete = [n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())]
+        complete = [
+            n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())
+        ]
         frames = {time: frame.select(complete) for time, frame in frames.items()}
 
         def cameras(held: str) -> Cameras:
@@ -184,7 +194,9 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
     # Only for its checks: each held-out camera has its own alignment.
     captures = [(prepare(own.source, align=False, match_colours=False), own.left_out) for own in opened]
     back = [own.held_back for own in opened]
-    return MixedRigs(CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed)
+    return MixedRigs(
+        CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed
+    )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from viewmend.utils.atomic_writes import TEMPORARY, write_atomically
 from viewmend.utils.untrusted_input import InputError
 
 KINDS: dict[str, type] = {
-    kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds)
+    kind.__name__: kind
+    for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds)
 }
 """The dataclasses that files may hold, by name; `storable` adds to them."""
 COMPRESSION = 1
@@ -74,7 +75,9 @@ def sample_from_bytes(data: bytes) -> Any:
     return sample
 
 
-def write_shards(samples: Iterable[object], folder: Path, shard_size: int = 48, first: int = 0) -> Iterator[Path]:
+def write_shards(
+    samples: Iterable[object], folder: Path, shard_size: int = 48, first: int = 0
+) -> Iterator[Path]:
     """Write tar files of `shard_size` samples, shard-00000.tar (or number `first`) and on; yields their paths.
 
     Each file is written completely or not at all.
@@ -96,12 +99,18 @@ def read_shard(path: Path, member: int | None = None) -> list[Any]:
     try:
         with tarfile.open(path, "r:") as tar:  # uncompressed, so that it cannot claim more than it holds
             members = tar.getmembers()
-            odd = [each.name for each in members if not each.isreg() or each.sparse or each.size > path.stat().st_size]
+            odd = [
+                each.name
+                for each in members
+                if not each.isreg() or each.sparse or each.size > path.stat().st_size
+            ]
             if odd:
                 raise ShardError(f"{odd[0]!r} is not a plain file")
             wanted = members if member is None else members[member : member + 1]
             files = [file for each in wanted if (file := tar.extractfile(each)) is not None]
-            return [sample_from_bytes(zlib.decompressobj().decompress(file.read(), MAX_BYTES)) for file in files]
+            return [
+                sample_from_bytes(zlib.decompressobj().decompress(file.read(), MAX_BYTES)) for file in files
+            ]
     except (tarfile.TarError, OSError, zlib.error, ShardError) as error:
         raise ShardError(f"{path}: expected a tar of samples ({error}); write this shard again") from error
 
@@ -109,7 +118,9 @@ def read_shard(path: Path, member: int | None = None) -> list[Any]:
 class ShardScenes(Generic[Kind]):
     """Shards as scenes, in another random order each time all have been used."""
 
-    def __init__(self, folder: Path, seed: str, kind: type[Kind], whole: bool = True, clip_length: int = 1) -> None:
+    def __init__(
+        self, folder: Path, seed: str, kind: type[Kind], whole: bool = True, clip_length: int = 1
+    ) -> None:
         """Find the shards. A scene is a whole shard, its samples in random order, or unless `whole` a single item.
 
         Raises:
@@ -121,7 +132,9 @@ class ShardScenes(Generic[Kind]):
         self.whole = whole
         self.clip_length = clip_length
         if not self.paths:
-            raise ShardError(f"{folder}: expected tar files, found none; write some with `viewmend make-dataset --out`")
+            raise ShardError(
+                f"{folder}: expected tar files, found none; write some with `viewmend make-dataset --out`"
+            )
         self._items = 1 if whole else len(read_shard(self.paths[0]))
 
     def scene(self, number: int) -> list[Kind]:
@@ -171,8 +184,13 @@ def _take_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         return {"tensor": name}
     if is_dataclass(value):
         parts = {f.name: _take_apart(getattr(value, f.name), tensors) for f in fields(value)}
-        kinds = (kind.__name__ for kind in type(value).__mro__)  # lazily selected views are stored as plain ones
-        return {"kind": next((kind for kind in kinds if kind in KINDS), type(value).__name__), "fields": parts}
+        kinds = (
+            kind.__name__ for kind in type(value).__mro__
+        )  # lazily selected views are stored as plain ones
+        return {
+            "kind": next((kind for kind in kinds if kind in KINDS), type(value).__name__),
+            "fields": parts,
+        }
     if isinstance(value, tuple):
         return [_take_apart(item, tensors) for item in value]
     return value
@@ -195,7 +213,9 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    return {name: hint for name, hint in get_type_hints(kind).items() if name in {f.name for f in fields(kind)}}
+    return {
+        name: hint for name, hint in get_type_hints(kind).items() if name in {f.name for f in fields(kind)}
+    }
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -50,7 +50,9 @@ class SharedRigScenes:
     "hull-with-target-mask", which is drawn for a whole rig, the masks of all held-out cameras carve the hull.
     """
 
-    def __init__(self, config: SceneConfig, sampling: SamplingConfig, seed: str, split: Split = "training") -> None:
+    def __init__(
+        self, config: SceneConfig, sampling: SamplingConfig, seed: str, split: Split = "training"
+    ) -> None:
         """`seed` determines everything random except the people, whose seeds belong to the split.
 
         Raises:
@@ -146,7 +148,9 @@ class _SharedRig:
         view = stream.with_render_config(render).render(camera, time)
         if int(view.holes.sum()) < self.sampling.min_hole_px:
             return None
-        truth = replace(self.studio.truth(self.studio.true_cameras.select([name]), time, on_stage=True), cameras=camera)
+        truth = replace(
+            self.studio.truth(self.studio.true_cameras.select([name]), time, on_stage=True), cameras=camera
+        )
         assert truth.mask is not None, "the studio draws masks"
         target_mask = None
         if self.protocol == "target-mask":

@@ -97,7 +97,9 @@ class StoredScene:
         ValueError if the stored scene is damaged.
         """
         if number >= len(self.held):
-            raise ValueError(f"expected a scene of {number + 1} views or more, got {len(self.held)}; {ADVICE}")
+            raise ValueError(
+                f"expected a scene of {number + 1} views or more, got {len(self.held)}; {ADVICE}"
+            )
         view = self.held[number]
         _check(self.frame, view.cameras)
         _check(view.truth, view.truth.cameras)
@@ -130,7 +132,9 @@ def _check(frame: MultiViewFrame, cameras: Cameras) -> None:
     size = (len(cameras), *reversed(cameras.max_size_px)) if len(cameras) else ()
     shapes = {(len(frame.rgb), *frame.rgb.shape[2:]), () if frame.mask is None else tuple(frame.mask.shape)}
     if shapes != {size}:
-        raise ValueError(f"expected stored images and masks of the cameras' sizes {size}, got {shapes}; {ADVICE}")
+        raise ValueError(
+            f"expected stored images and masks of the cameras' sizes {size}, got {shapes}; {ADVICE}"
+        )
 
 
 def store_scene(scene: Scene, config: SceneConfig, depth_model: Inpainter | None = None) -> StoredScene:
@@ -175,7 +179,9 @@ def _fused_geometry(
     return proxy
 
 
-def _store_view(scene: Scene, name: str, time: int, proxy: GeometryProxy, left_out: tuple[str, ...] = ()) -> StoredView:
+def _store_view(
+    scene: Scene, name: str, time: int, proxy: GeometryProxy, left_out: tuple[str, ...] = ()
+) -> StoredView:
     mesh = proxy.mesh
     truth = scene.rig.truth(name, time)
     bounds = proxy.bounds
@@ -199,18 +205,24 @@ def _on_black(frame: MultiViewFrame) -> MultiViewFrame:
     return replace(frame, rgb=frame.rgb * (frame.mask > 0)[:, None], depth=None, time=0)
 
 
-def _upsampled(depth: Float[Tensor, "view rows columns"], frame: MultiViewFrame) -> Float[Tensor, "view height width"]:
+def _upsampled(
+    depth: Float[Tensor, "view rows columns"], frame: MultiViewFrame
+) -> Float[Tensor, "view height width"]:
     """A depth of every second pixel, repeated for the others."""
     height, width = frame.rgb.shape[2:]
     if depth.shape != (len(frame.rgb), -(-height // 2), -(-width // 2)):
-        raise ValueError(f"expected the depth of every second pixel, got the shape {tuple(depth.shape)}; {ADVICE}")
+        raise ValueError(
+            f"expected the depth of every second pixel, got the shape {tuple(depth.shape)}; {ADVICE}"
+        )
     return depth.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
 
 
 def _proxy(view: StoredView) -> GeometryProxy:
     faces = view.faces.cumsum(0, dtype=torch.int32).reshape(-1, 3)
     if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(view.vertices):
-        raise ValueError(f"expected faces of {len(view.vertices)} stored vertices, got other indices; {ADVICE}")
+        raise ValueError(
+            f"expected faces of {len(view.vertices)} stored vertices, got other indices; {ADVICE}"
+        )
     mesh = Mesh(view.bounds.low + view.vertices.float() / STEPS * view.bounds.size_m, faces)
     return GeometryProxy(mesh, vertex_normals(mesh), view.bounds)
 

@@ -122,7 +122,9 @@ def initial_model(config: "ViewsObjectiveConfig", precision: str) -> ViewSynthNe
         source = load_network(config.coarse_from)
         fill = source.coarse if isinstance(source, ViewSynthNet) else source
         weights = fill.state_dict() if isinstance(fill, RayFill) else {}
-        if {k: v.shape for k, v in weights.items()} != {k: v.shape for k, v in net.coarse.state_dict().items()}:
+        if {k: v.shape for k, v in weights.items()} != {
+            k: v.shape for k, v in net.coarse.state_dict().items()
+        }:
             raise ValueError(
                 f"expected a model with a ray fill of the recipe's sizes, got '{config.coarse_from}'; name another "
                 "one by --coarse-from"
@@ -205,7 +207,9 @@ def recolour(sample: Sample, random: Random) -> Sample:
     images = frame.rgb[:, channels], sample.truth[channels]
     rgb, truth = ((gain * image.float()).round().to(torch.uint8) for image in images)
     view = replace(sample.view, rgb=gain * sample.view.rgb[channels])
-    return replace(sample, view=view, ray_views=replace(sample.ray_views, frame=replace(frame, rgb=rgb)), truth=truth)
+    return replace(
+        sample, view=view, ray_views=replace(sample.ray_views, frame=replace(frame, rgb=rgb)), truth=truth
+    )
 
 
 def random_crop(whole: TrainingView) -> TrainingView:
@@ -230,7 +234,9 @@ def random_selection(crop: TrainingView) -> Mask | None:
     scattered = (torch.rand(crop.view.mask.shape) < 0.01 * float(torch.rand(()))).to(crop.view.mask.device)
     radius = int(torch.randint(5, ()))
     seeds = (crop.wrong | crop.view.holes | scattered).float()
-    selected = (F.max_pool2d(seeds[None], 2 * radius + 1, 1, radius)[0] > 0) & (rim_depth(crop.view.depth) > 0)
+    selected = (F.max_pool2d(seeds[None], 2 * radius + 1, 1, radius)[0] > 0) & (
+        rim_depth(crop.view.depth) > 0
+    )
     return selected if bool(selected.any()) else None
 
 
@@ -247,7 +253,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
     """The loss of `ViewSynthNet` on a random crop of each view of a batch."""
 
     loss_summary = (
-        "L1 of colours with terms of LPIPS, gradients, alpha, depth, visibility, confidence and predicted errors"
+        "L1 of colours with terms of LPIPS, gradients, alpha, "
+        "depth, visibility, confidence and predicted errors"
     )
 
     def __init__(self, config: TrainConfig, options: "ViewsObjectiveConfig", start: nn.Module | None) -> None:
@@ -274,7 +281,9 @@ class ViewsObjective(Objective[ViewSynthNet]):
     def forward(self, batch: Sequence[TrainingView]) -> StepOutput:
         """The mean terms of the batch."""
         terms = [self._terms(random_crop(view)) for view in batch]
-        image = ImageLoss(*(torch.stack(values).mean() for values in zip(*(own[1:] for own in terms), strict=True)))
+        image = ImageLoss(
+            *(torch.stack(values).mean() for values in zip(*(own[1:] for own in terms), strict=True))
+        )
         return StepOutput(image, torch.stack([own[0] for own in terms]).mean())
 
     def _terms(self, crop: TrainingView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -294,7 +303,9 @@ class ViewsObjective(Objective[ViewSynthNet]):
         right = (crop.view.rgb - truth)[:, at[0], at[1]].abs().amax(0) < RIGHT
         total = total + weights.damage * (right * F.relu(off.abs().amax(1) - DAMAGED)).mean()
         total = total + weights.gradient * _gradient_loss(made, off, crop.view.mask.shape)
-        total = total + weights.alpha * ((made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha))
+        total = total + weights.alpha * (
+            (made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha)
+        )
         total = total + weights.confidence * _cross_entropy(made.confidence, correct)
         total = total + self._cell_terms(crop, made)
         total = total + weights.perceptual * self._perceptual_term(crop, made)
@@ -389,7 +400,9 @@ class ViewsObjectiveConfig(ObjectiveConfig):
         return StoredSceneMaker(rig_source(scenes, self.sampling.frames, seed), scenes, depth_model)
 
 
-def _gradient_loss(made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size) -> Float[Tensor, ""]:
+def _gradient_loss(
+    made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size
+) -> Float[Tensor, ""]:
     """Mean difference between the errors of neighbouring predicted pixels."""
     image = scatter_to_image(F.pad(off, (0, 1), value=1.0), made.pixels, shape)
     total = image.new_zeros(())
@@ -403,7 +416,9 @@ def _gradient_loss(made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: t
     return total / number.clamp_min(1)
 
 
-def visible_cameras(crop: TrainingView, made: ViewPrediction, z: Float[Tensor, "cell"]) -> Bool[Tensor, "cell view"]:
+def visible_cameras(
+    crop: TrainingView, made: ViewPrediction, z: Float[Tensor, "cell"]
+) -> Bool[Tensor, "cell view"]:
     """Which cameras see the true surface of each cell, at z-depth `z` in metres."""
     centers = CELL_PX * (made.distribution.cells.flip(1).float() + 0.5)
     points = unproject(centers[None], z[None], crop.view.camera)[0]
@@ -445,7 +460,9 @@ class ViewsValidation:
         assert isinstance(model, ViewSynthNet)
         if not self._views:
             scenes = validation_scenes(self.config.scenes, self.options.sampling)
-            samples = StoredSamples(StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation")
+            samples = StoredSamples(
+                StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation"
+            )
             net = initial_model(self.options, self.config.precision)
             source = TrainingViews(samples, "validation", net, smooth_guess=0.0)
             views = (view for number in count() for view in source.scene(number))

@@ -115,7 +115,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
         FloatingPointError: a value is not finite; an existing file at `path` is unchanged.
     """
     plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-    broken = [key for key, value in plain.items() if value.is_floating_point() and not bool(value.isfinite().all())]
+    broken = [
+        key for key, value in plain.items() if value.is_floating_point() and not bool(value.isfinite().all())
+    ]
     if broken:
         raise FloatingPointError(
             f"{path}: expected finite values, got NaN or infinity in {len(broken)} of {len(plain)} tensors "

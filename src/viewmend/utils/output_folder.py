@@ -50,9 +50,13 @@ class OutputFolder:
             OSError: it cannot be created or written to.
         """
         if self.path.exists() and not self.path.is_dir():
-            raise ValueError(f"{self.path}: expected a folder for the results, got a file; choose another --out")
+            raise ValueError(
+                f"{self.path}: expected a folder for the results, got a file; choose another --out"
+            )
         if (hidden := self.path / HIDDEN).is_symlink() or (hidden.exists() and not hidden.is_dir()):
-            raise ValueError(f"{hidden}: expected a folder that a run has made, got something else; move it away")
+            raise ValueError(
+                f"{hidden}: expected a folder that a run has made, got something else; move it away"
+            )
         self._new = not self.path.exists()
         (self.path / HIDDEN).mkdir(parents=True, exist_ok=True)
         self._lock = _acquire_lock(self.path)
@@ -100,7 +104,9 @@ class OutputFolder:
         A pattern that was recorded as changing is replaced by the hashes of its files when recorded again.
         """
         if changing:
-            others = {n: value for n, value in self._read().items() if not any(fnmatch(n, p) for p in patterns)}
+            others = {
+                n: value for n, value in self._read().items() if not any(fnmatch(n, p) for p in patterns)
+            }
             self._write(others | {pattern: [] for pattern in patterns})
             return
         found = {file.relative_to(self.path).as_posix(): [_digest(file)] for file in self._files(patterns)}
@@ -124,7 +130,9 @@ class OutputFolder:
                 (self.path / name).rename(self.draft / f"old-{name}")
             with contextlib.suppress(FileNotFoundError):
                 (self.draft / name).rename(self.path / name)
-        gone = {name for name in known if any(name == n or name.startswith(f"{n}/") for n in names)} - new.keys()
+        gone = {
+            name for name in known if any(name == n or name.startswith(f"{n}/") for n in names)
+        } - new.keys()
         self._write({name: value for name, value in (known | new).items() if name not in gone})
 
     def _files(self, patterns: Iterable[str]) -> Iterator[Path]:
@@ -139,7 +147,9 @@ class OutputFolder:
             return {}  # no readable manifest: own nothing
 
     def _write(self, files: dict[str, list[str]]) -> None:
-        write_text(self._manifest, json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True))
+        write_text(
+            self._manifest, json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
+        )
 
 
 def _acquire_lock(folder: Path) -> BaseFileLock:
@@ -149,10 +159,14 @@ def _acquire_lock(folder: Path) -> BaseFileLock:
         ValueError: another run is using the folder.
         OSError: the folder cannot be written to.
     """
-    in_use = f"{folder}: expected a folder that no other run is using, got one in use; wait for that run to finish"
+    in_use = (
+        f"{folder}: expected a folder that no other run is using, got one in use; wait for that run to finish"
+    )
     lock = FileLock(folder / HIDDEN / LOCK)
     try:
-        with warnings.catch_warnings(record=True) as fallback:  # where the call is missing, filelock makes a marker
+        with warnings.catch_warnings(
+            record=True
+        ) as fallback:  # where the call is missing, filelock makes a marker
             warnings.simplefilter("always")
             lock.acquire(timeout=0)
         if fallback:

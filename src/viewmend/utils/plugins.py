@@ -41,7 +41,9 @@ def load_from_file(name: str) -> Callable[..., object]:
             raise
     make = getattr(sys.modules[module_name], wanted, None)
     if not callable(make):
-        raise ValueError(f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME")
+        raise ValueError(
+            f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME"
+        )
     return make
 
 

@@ -91,9 +91,13 @@ def numbers(value: Any, *shape: int) -> np.ndarray:
         elif isinstance(one, int | float):
             found.append(one)
         else:
-            raise ValueError(f"expected {count} numbers, got {type(one).__name__}; export the calibration again")
+            raise ValueError(
+                f"expected {count} numbers, got {type(one).__name__}; export the calibration again"
+            )
     if len(found) != count or pending:
-        raise ValueError(f"expected {count} numbers, got {len(found) if not pending else 'more'}; export it again")
+        raise ValueError(
+            f"expected {count} numbers, got {len(found) if not pending else 'more'}; export it again"
+        )
     return np.array(found, float).reshape(shape)
 
 
@@ -101,7 +105,9 @@ def _execute(data: bytes) -> Any:
     """The value of a pickle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised for invalid escapes in strings
-        for opcode, argument, _ in pickletools.genops(data):  # lengths are checked before memory is allocated for them
+        for opcode, argument, _ in pickletools.genops(
+            data
+        ):  # lengths are checked before memory is allocated for them
             if "PUT" in opcode.name and (argument or 0) > len(data):
                 raise ValueError(f"the memo {argument}")
         return _Unpickler(io.BytesIO(data), encoding="latin-1").load()

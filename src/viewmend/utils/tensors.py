@@ -58,7 +58,9 @@ def _copied(tensor: Tensor) -> Tensor:
     size = tensor.numel() * tensor.element_size()
     if tensor.device.type != "cpu" or size < LARGE_BYTES:
         return tensor
-    return torch.frombuffer(mmap.mmap(-1, size, **PRIVATE), dtype=tensor.dtype).view(tensor.shape).copy_(tensor)
+    return (
+        torch.frombuffer(mmap.mmap(-1, size, **PRIVATE), dtype=tensor.dtype).view(tensor.shape).copy_(tensor)
+    )
 
 
 def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
@@ -115,12 +117,16 @@ def check_tensor(
         padded: whether larger images are allowed.
     """
     if not isinstance(value, Tensor):
-        raise ValueError(f"expected {name} as a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
+        raise ValueError(
+            f"expected {name} as a tensor, got {type(value).__name__}; convert it with torch.as_tensor"
+        )
     fixed = len(shape) - 2 if padded else len(shape)
     same = value.ndim == len(shape) and tuple(value.shape[:fixed]) == tuple(shape[:fixed])
     if not same or any(own < least for own, least in zip(value.shape[fixed:], shape[fixed:], strict=True)):
         least = " or larger images" if padded else ""
-        raise ValueError(f"expected {name} of shape {tuple(shape)}{least}, got {tuple(value.shape)}; {arrange}")
+        raise ValueError(
+            f"expected {name} of shape {tuple(shape)}{least}, got {tuple(value.shape)}; {arrange}"
+        )
     if value.dtype not in dtypes:
         raise ValueError(f"expected {name} as {' or '.join(map(str, dtypes))}, got {value.dtype}; {convert}")
     return value

@@ -36,7 +36,9 @@ def bounded_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     with path.open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
-        raise ValueError(f"expected {path.name} to have at most {most} bytes, got more; is it the right file?")
+        raise ValueError(
+            f"expected {path.name} to have at most {most} bytes, got more; is it the right file?"
+        )
     return data
 
 
@@ -80,14 +82,18 @@ def read_json(text: str | bytes) -> Any:
     """
     opening = (b"[", b"{") if isinstance(text, bytes) else ("[", "{")
     if (parts := sum(map(text.count, opening))) > MOST_PARTS:  # pyright: ignore[reportArgumentType]
-        raise ValueError(f"expected JSON of at most {MOST_PARTS} lists and objects, got {parts}; is it the right file?")
+        raise ValueError(
+            f"expected JSON of at most {MOST_PARTS} lists and objects, got {parts}; is it the right file?"
+        )
     try:
         return json.loads(text, object_hook=_without_nulls, parse_float=_number)
     except (ValueError, RecursionError) as error:  # bad syntax, bad bytes, numbers with thousands of digits
         raise ValueError(f"expected JSON, got something else: {str(error)[:80]}; correct it") from None
 
 
-def typed(value: Any, kind: type[Kind] | Any, next_step: str = "correct the value", strict: bool = True) -> Kind:
+def typed(
+    value: Any, kind: type[Kind] | Any, next_step: str = "correct the value", strict: bool = True
+) -> Kind:
     """Convert a parsed value to `kind`. A null key counts as absent; unknown keys are ignored.
 
     Args:
@@ -135,7 +141,9 @@ def _explained(error: str, value: Any, kind: Any, next_step: str) -> str:
         text = f"expected keys among {', '.join(kind.__struct_fields__)}, got '{unknown[1][:40]}'"
     elif wanted := re.fullmatch(r"Expected (.*?)(, got [^,]*)?", error, re.DOTALL):
         text = f"expected {_in_plain_words(wanted[1])}, got {shown(got, 80)}"
-    elif error.startswith("Invalid value") and (tags := [part.__struct_config__.tag for part in get_args(kind)]):
+    elif error.startswith("Invalid value") and (
+        tags := [part.__struct_config__.tag for part in get_args(kind)]
+    ):
         text = f"expected {' or '.join(tags)}, got {shown(got, 80)}"
     elif re.match(r"Invalid |Number out of range", error):
         text = f"expected another value, got {shown(got, 80)}"
@@ -155,7 +163,9 @@ def _follow(value: Any, path: str) -> tuple[str, Any]:
 
 def _in_plain_words(expected: str) -> str:
     expected = re.sub(r"`float` [<>]= -?1e\+300", "a finite number", expected)
-    expected = re.sub(r"`str` matching regex '\^\((.*)\)\\\\Z'", lambda words: words[1].replace("|", " or "), expected)
+    expected = re.sub(
+        r"`str` matching regex '\^\((.*)\)\\\\Z'", lambda words: words[1].replace("|", " or "), expected
+    )
     expected = expected.replace("of length >= 1", "that is not empty")
     return re.sub(r"`([^`]*)`", _kinds_in_plain_words, expected)
 

@@ -51,15 +51,23 @@ def load_weights(network: Network, path: str | Path, device: torch.device | str 
         "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
         "unknown": sorted(weights.keys() - own.keys()),
         "of another shape": [
-            f"{key} {tuple(a.shape)} for {tuple(b.shape)}" for key, (a, b) in both.items() if a.shape != b.shape
+            f"{key} {tuple(a.shape)} for {tuple(b.shape)}"
+            for key, (a, b) in both.items()
+            if a.shape != b.shape
         ],
-        "of another kind of number": [key for key, (value, wanted) in both.items() if not _is_same_kind(value, wanted)],
+        "of another kind of number": [
+            key for key, (value, wanted) in both.items() if not _is_same_kind(value, wanted)
+        ],
         "not finite": [  # in the precision of the network's own tensor
-            key for key, (a, b) in both.items() if a.dtype in FLOATS and not bool(a.to(b.dtype).isfinite().all())
+            key
+            for key, (a, b) in both.items()
+            if a.dtype in FLOATS and not bool(a.to(b.dtype).isfinite().all())
         ],
     }
     if any(wrong.values()):
-        counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
+        counts = ", ".join(
+            f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys
+        )
         name = type(network).__name__
         raise MismatchedWeightsError(
             f"{path}: expected the {len(own)} tensors of {name}, got {len(weights)}: {counts}; give the weights that "
@@ -86,7 +94,9 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise DamagedWeightsError(f"{path}: expected a file of weights, found none; check the path")
     try:
-        found = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+        found = (
+            load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+        )
     except Exception as error:  # damaged files raise almost any exception
         said = f"{type(error).__name__}: {' '.join(str(error).split()).split('. ')[0][:120]}"
         raise DamagedWeightsError(
@@ -95,7 +105,9 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
         ) from error
     if isinstance(found, dict) and isinstance(found.get(WRAPPER), dict):
         found = found[WRAPPER]
-    if not isinstance(found, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in found.items()):
+    if not isinstance(found, dict) or not all(
+        isinstance(k, str) and isinstance(v, Tensor) for k, v in found.items()
+    ):
         kind = f"a dictionary of {list(found)[:4]}" if isinstance(found, dict) else type(found).__name__
         raise MismatchedWeightsError(
             f"{path}: expected a dictionary of tensors, plain or under '{WRAPPER}', got {kind}; give the "

@@ -92,7 +92,9 @@ def test_on_white_only_the_background_differs(framing, clip_of_two):
     assert torch.equal(made.frames, expected.frames) and torch.equal(made.holes, expected.holes)
     assert torch.equal(made.references, expected.references)
     assert bool((made.truth[..., 0][black.truth[..., 0] == -1] == 1).any())
-    assert float((made.truth - black.truth).min()) > -0.1, "as bright or brighter, except for ringing of the resize"
+    assert float((made.truth - black.truth).min()) > -0.1, (
+        "as bright or brighter, except for ringing of the resize"
+    )
     with pytest.raises(ValueError, match="expected samples with alpha"):
         training_clip(clip_of_two, SIZE, framing, "white")
 
@@ -171,7 +173,11 @@ def test_a_network_is_trained_resumed_and_usable_as_a_method(tmp_path, monkeypat
     monkeypatch.setattr(RunClock, "checkpoint_due", lambda self: calls.append(0) or len(calls) == 2)
     monkeypatch.setattr(RunClock, "saved", lambda self: calls.clear())
     clips = studio_samples("tests", clip_length=2)
-    list(write_shards((s for number in range(3) for s in clips.scene(number)), tmp_path / "shards", shard_size=2))
+    list(
+        write_shards(
+            (s for number in range(3) for s in clips.scene(number)), tmp_path / "shards", shard_size=2
+        )
+    )
     config = config_of(shards=tmp_path / "shards", validate_every=3, validation_views=1)
     train(config, tmp_path / "whole")
     with join_processes() as own:
@@ -183,12 +189,19 @@ def test_a_network_is_trained_resumed_and_usable_as_a_method(tmp_path, monkeypat
     torch.manual_seed(config.seed)
     fresh = DSTT().state_dict()
     assert sum(not torch.equal(whole[key], fresh[key]) for key in fresh) > 150, "all of it is trained"
-    assert "Views on black. Use as the method `dstt-o-def@FOLDER`." in (tmp_path / "whole/README.md").read_text()
+    assert (
+        "Views on black. Use as the method `dstt-o-def@FOLDER`." in (tmp_path / "whole/README.md").read_text()
+    )
     assert '"telea"' in (tmp_path / "whole/log.jsonl").read_text()
     network = load_baseline("dstt", f"@{tmp_path / 'whole'}")
     assert all(torch.equal(value, whole[key]) for key, value in network.state_dict().items())
-    tuned = train(replace(config, steps=1, start=str(tmp_path / "whole"), validate_every=0), tmp_path / "tuned")
-    steps = [float((value - whole[key]).abs().max()) for key, value in load_file(tuned / "model.safetensors").items()]
+    tuned = train(
+        replace(config, steps=1, start=str(tmp_path / "whole"), validate_every=0), tmp_path / "tuned"
+    )
+    steps = [
+        float((value - whole[key]).abs().max())
+        for key, value in load_file(tuned / "model.safetensors").items()
+    ]
     assert 0 < max(steps) < 2e-4, "one step of Adam from the checkpoint"
     for name in ("whole", "parts", "tuned"):  # a gigabyte
         shutil.rmtree(tmp_path / name)

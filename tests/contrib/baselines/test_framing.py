@@ -30,7 +30,9 @@ def test_windows_cover_every_hole_and_stitch_to_one_picture(height, width, overl
 
 
 @given(st.integers(24, 200), st.integers(40, 200), st.integers(0, 23))
-def test_neighbouring_windows_overlap_by_what_is_asked_and_there_are_no_more_than_needed(height, width, overlap):
+def test_neighbouring_windows_overlap_by_what_is_asked_and_there_are_no_more_than_needed(
+    height, width, overlap
+):
     windows = windows_over(torch.ones(height, width, dtype=torch.bool), SIZE, overlap)
     for starts, length, side in (
         (sorted({w.top for w in windows}), height, SIZE[0]),
@@ -38,7 +40,9 @@ def test_neighbouring_windows_overlap_by_what_is_asked_and_there_are_no_more_tha
     ):
         assert starts[0] == 0 and starts[-1] + side == length
         assert all(a + side - b >= overlap for a, b in pairwise(starts))
-        assert len(starts) == 1 or (len(starts) - 1) * (side - overlap) + overlap < length, "one fewer is too few"
+        assert len(starts) == 1 or (len(starts) - 1) * (side - overlap) + overlap < length, (
+            "one fewer is too few"
+        )
 
 
 def test_where_windows_meet_one_fades_into_the_other():

@@ -33,7 +33,9 @@ def test_deformable_convolution_learns_its_offsets(rng):
     offsets = (torch.rand(1, 18, 4, 5, generator=rng) * 0.8 + 0.1).requires_grad_()
     masks = torch.rand(1, 9, 4, 5, generator=rng).requires_grad_()
     with pytest.warns(UserWarning, match="double precision"):
-        assert gradcheck(lambda o, m: deform_conv2d(x, o, m, weight, None), (offsets, masks), eps=1e-2, atol=1e-2)
+        assert gradcheck(
+            lambda o, m: deform_conv2d(x, o, m, weight, None), (offsets, masks), eps=1e-2, atol=1e-2
+        )
 
 
 @pytest.mark.parametrize("size", [(9, 12), (10, 13)])

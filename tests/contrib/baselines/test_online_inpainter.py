@@ -74,7 +74,9 @@ def test_every_hole_pixel_is_filled_and_nothing_else_changes(framing):
 def test_a_hole_keeps_the_share_of_the_render_that_e_says(framing):
     view = plate(0)
     [(completed, _)] = stream(OnlineInpainter(Recorder(), config(framing=framing)), [view])
-    [(black, _)] = stream(OnlineInpainter(Recorder(), config(framing=framing)), [replace(view, rgb=0 * view.rgb)])
+    [(black, _)] = stream(
+        OnlineInpainter(Recorder(), config(framing=framing)), [replace(view, rgb=0 * view.rgb)]
+    )
     soft = view.error == 0.5
     assert bool(soft.any())
     assert torch.allclose((completed.rgb - black.rgb)[:, soft], 0.5 * view.rgb[:, soft], atol=1e-6)
@@ -94,7 +96,11 @@ def test_a_view_sees_three_neighbours_and_three_references_of_the_absolute_grid(
 
 def test_the_relative_grid_is_the_other_papers():
     network = Recorder()
-    list(stream(OnlineInpainter(network, config(sampling=Sampling(grid="relative"))), map(times_view, range(36))))
+    list(
+        stream(
+            OnlineInpainter(network, config(sampling=Sampling(grid="relative"))), map(times_view, range(36))
+        )
+    )
     clip = network.clips[35]
     assert [times_in(f)[0] for f in clip.neighbours] == [34, 33, 32]
     assert [times_in(f)[0] for f in clip.references] == [25, 15, 5]
@@ -142,7 +148,9 @@ def test_only_mul_asks_for_cameras_and_never_for_the_future():
         if framing != "mul":
             assert rig.asked == []
             continue
-        assert all(len(clip.now) == 3 for clip in network.clips), "the view and the two cameras that coloured it"
+        assert all(len(clip.now) == 3 for clip in network.clips), (
+            "the view and the two cameras that coloured it"
+        )
         assert {names for _, names in rig.asked} == {("left", "right")}
         assert max(time for time, _ in rig.asked) == 2
         assert sorted(time for time, _ in rig.asked[-3:]) == [0, 1, 2]

@@ -31,7 +31,12 @@ def frames(kind, count, rng):
     return 2 * torch.rand(count, 3, *SIZES[kind], generator=rng) - 1
 
 
-ALL = [DSTT, pytest.param(FuseFormer, marks=pytest.mark.slow), pytest.param(E2FGVI, marks=pytest.mark.slow), E2FGVIHQ]
+ALL = [
+    DSTT,
+    pytest.param(FuseFormer, marks=pytest.mark.slow),
+    pytest.param(E2FGVI, marks=pytest.mark.slow),
+    E2FGVIHQ,
+]
 
 
 @torch.no_grad()

@@ -49,7 +49,9 @@ def drawn_frames(frames, seed):
     return torch.from_numpy(images[0].astype(np.float32))
 
 
-@pytest.mark.parametrize("name", [n if n == "dstt_om_4" else pytest.param(n, marks=pytest.mark.slow) for n in FILES])
+@pytest.mark.parametrize(
+    "name", [n if n == "dstt_om_4" else pytest.param(n, marks=pytest.mark.slow) for n in FILES]
+)
 @torch.inference_mode()
 def test_the_baselines_compute_what_the_published_networks_do(name, shared):
     case = np.load(shared / "parity" / f"{name}.npz")

@@ -59,7 +59,9 @@ def test_another_networks_weights_are_refused(weights):
         make_baseline(f"dstt-o-def@{weights / 'absent'}")
 
 
-@pytest.mark.parametrize("name", ["dstt", "dstt-o", "dstt-x-def", "dstt-o-all", "sttn-o-def", "dstt-o-def@", "telea"])
+@pytest.mark.parametrize(
+    "name", ["dstt", "dstt-o", "dstt-x-def", "dstt-o-all", "sttn-o-def", "dstt-o-def@", "telea"]
+)
 def test_other_names_are_none(name):
     with pytest.raises(ValueError, match="expected a name like dstt-o-def"):
         make_baseline(name)

@@ -9,7 +9,15 @@ from torch import nn
 from torch.nn.functional import avg_pool2d
 
 from viewmend.contrib.baselines import rgvi
-from viewmend.contrib.baselines.rgvi import PAST_FRAMES, Rgvi, RgviState, dis_flow, disagreeing, make_rgvi, pull
+from viewmend.contrib.baselines.rgvi import (
+    PAST_FRAMES,
+    Rgvi,
+    RgviState,
+    dis_flow,
+    disagreeing,
+    make_rgvi,
+    pull,
+)
 from viewmend.geometry.cameras import Cameras
 from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights
@@ -39,7 +47,9 @@ def view(truth, time, hole=(slice(30, 50), slice(40, 60))):
     error[hole] = 1
     camera = Cameras(("c",), torch.eye(3)[None], torch.eye(4)[None], torch.tensor([[SIZE, SIZE]]))
     ones = torch.ones(SIZE, SIZE)
-    return IncompleteView(camera, truth * (error == 0), ones, error, ones, (), torch.zeros(0, SIZE, SIZE), time)
+    return IncompleteView(
+        camera, truth * (error == 0), ones, error, ones, (), torch.zeros(0, SIZE, SIZE), time
+    )
 
 
 def constant(x, y):
@@ -73,7 +83,9 @@ def in_hole(completed, truth):
 def test_flow_that_does_not_lead_home_disagrees():
     right = constant(3, 2)
     assert not disagreeing(right, -right)[:-2, :-3].any()
-    assert disagreeing(right, -right)[-2:].all() and disagreeing(right, -right)[:, -3:].all()  # out of the picture
+    assert (
+        disagreeing(right, -right)[-2:].all() and disagreeing(right, -right)[:, -3:].all()
+    )  # out of the picture
     assert disagreeing(right, right).all() and not disagreeing(right, -right + 0.4)[:-2, :-3].any()
     wrong = right.clone()
     wrong[:, 10, 20] = 9
@@ -124,7 +136,9 @@ def test_a_view_of_another_size_starts_a_new_past(texture):
     _, state = stream(Rgvi(), texture, 2)
     small = view(at(texture, 2), 2)
     rgb, weights = small.rgb[:, :64], small.weights[:, :64]
-    part = IncompleteView(small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2)
+    part = IncompleteView(
+        small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2
+    )
     completed, state = Rgvi().step(part, no_context, state)
     assert isinstance(state, RgviState) and len(state.past) == 1 and completed.rgb.shape == (3, 64, SIZE)
 

@@ -54,14 +54,20 @@ def saved(path, contents):
 
 def test_another_networks_weights_are_refused(weights, tmp_path):
     path = saved(tmp_path / "DSTT.pth", {"netG": weights})
-    with pytest.raises(MismatchedWeightsError, match=r"expected the 160 tensors of FuseFormer, got 158: \d+ missing"):
+    with pytest.raises(
+        MismatchedWeightsError, match=r"expected the 160 tensors of FuseFormer, got 158: \d+ missing"
+    ):
         load_weights(FuseFormer(), path)
     # HQ and plain E2FGVI differ in one bias alone.
     path = saved(tmp_path / "E2FGVI.pth", E2FGVI().state_dict())
-    with pytest.raises(MismatchedWeightsError, match=r"2 missing \(sc.bias_conv.bias.*1 unknown \(sc.bias ...\)"):
+    with pytest.raises(
+        MismatchedWeightsError, match=r"2 missing \(sc.bias_conv.bias.*1 unknown \(sc.bias ...\)"
+    ):
         load_weights(E2FGVIHQ(), path)
     wrong = weights | {"patch2vec.bias": torch.zeros(7)}
-    with pytest.raises(MismatchedWeightsError, match=r"1 of another shape \(patch2vec.bias \(7,\) for \(512,\) "):
+    with pytest.raises(
+        MismatchedWeightsError, match=r"1 of another shape \(patch2vec.bias \(7,\) for \(512,\) "
+    ):
         load_weights(fresh(), saved(tmp_path / "x.pth", wrong))
 
 
@@ -90,7 +96,9 @@ def test_damaged_files_are_refused(form, weights, tmp_path):
             load_weights(fresh(), path)
 
 
-@pytest.mark.parametrize("contents", [[1, 2], {"netG": {"epoch": 3}}, {"state_dict": {"a": torch.zeros(1)}}, {"a": 1}])
+@pytest.mark.parametrize(
+    "contents", [[1, 2], {"netG": {"epoch": 3}}, {"state_dict": {"a": torch.zeros(1)}}, {"a": 1}]
+)
 def test_files_without_weights_are_refused(contents, tmp_path):
     with pytest.raises(MismatchedWeightsError, match="expected a dictionary of tensors"):
         load_weights(fresh(), saved(tmp_path / "x.pth", contents))

@@ -145,7 +145,9 @@ def test_all_watchers_get_the_same_bytes(on_air):
 
 def test_http_headers_metrics_and_missing_files(on_air):
     _, headers, content = fetch(on_air, "/broadcast/live.m3u8")
-    assert headers["content-type"] == "application/vnd.apple.mpegurl" and headers["cache-control"] == "max-age=1"
+    assert (
+        headers["content-type"] == "application/vnd.apple.mpegurl" and headers["cache-control"] == "max-age=1"
+    )
     _, headers, segment = fetch(on_air, f"/broadcast/{content.decode().split()[-1]}")
     assert headers["content-type"] == "video/mp4" and headers["cache-control"] == "max-age=60" and segment
     assert fetch(on_air, "/broadcast/1.m4s")[0] == 404
@@ -174,7 +176,9 @@ def test_nothing_is_rendered_or_encoded_while_nothing_is_watched():
         assert not server.service._sessions and extension.session.image is None
         assert fetch(server, f"/broadcast/{first}")[0] == 404
         again = playlist(server)  # a new video, whose segments are numbered on
-        assert "#EXT-X-DISCONTINUITY" in again and int(again.split()[-1].removesuffix(".m4s")) > int(first[:-4])
+        assert "#EXT-X-DISCONTINUITY" in again and int(again.split()[-1].removesuffix(".m4s")) > int(
+            first[:-4]
+        )
     wait_until(lambda: set(encoders()) <= set(others))
 
 
@@ -276,7 +280,9 @@ def test_the_token_is_added_to_all_names_in_the_playlist():
         assert fetch(server, "/broadcast/live.m3u8")[0] == 401
         plain = fetch(server, "/broadcast/live.m3u8", token)[2].decode()
         assert token not in plain and "?" not in plain
-        with av.open(f"{server.url}/broadcast/live.m3u8?token=0123456789abcdef%26%3D", timeout=WAIT_S) as container:
+        with av.open(
+            f"{server.url}/broadcast/live.m3u8?token=0123456789abcdef%26%3D", timeout=WAIT_S
+        ) as container:
             assert next(container.decode(video=0)).width == SIZE[0]
     text = b'#EXTM3U\n#EXT-X-MAP:URI="init.mp4"\n#EXTINF:1.0,\n7.m4s\n#EXTINF:1.0,\n8.m4s\n'
     expected = b'#EXTM3U\n#EXT-X-MAP:URI="init.mp4?token=a"\n#EXTINF:1.0,\n7.m4s?token=a\n#EXTINF:1.0,\n8.m4s?token=a\n'
@@ -299,7 +305,9 @@ def test_the_frame_rate_is_the_sources_within_bounds(source, video):
     assert choose_fps(source) == video
 
 
-@pytest.mark.parametrize(("text", "words"), [("1280", "WIDTHxHEIGHT"), ("1280x719", "even"), ("4096x4096", "2048")])
+@pytest.mark.parametrize(
+    ("text", "words"), [("1280", "WIDTHxHEIGHT"), ("1280x719", "even"), ("4096x4096", "2048")]
+)
 def test_invalid_sizes_are_refused(text, words):
     with pytest.raises(ValueError, match=words):
         broadcast_extension(text)
@@ -319,7 +327,9 @@ def grey(level, width=64, height=48):
 def listed(film):
     """Lines of the playlist: what it says, and the segments that it names."""
     lines = film.file(PLAYLIST).decode().split()
-    return [line for line in lines if line.startswith("#")], [line for line in lines if not line.startswith("#")]
+    return [line for line in lines if line.startswith("#")], [
+        line for line in lines if not line.startswith("#")
+    ]
 
 
 def played(film, names):
@@ -327,7 +337,9 @@ def played(film, names):
     data = film.file(INIT) + b"".join(film.file(name) for name in names)
     with av.open(BytesIO(data)) as container:
         frames = list(container.decode(video=0))
-    return [round(float(f.pts * f.time_base) * FPS) for f in frames], [f.to_ndarray(format="rgb24") for f in frames]
+    return [round(float(f.pts * f.time_base) * FPS) for f in frames], [
+        f.to_ndarray(format="rgb24") for f in frames
+    ]
 
 
 def test_each_picture_comes_at_its_time_and_each_second_is_a_segment_of_its_own():

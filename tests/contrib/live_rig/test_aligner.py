@@ -39,7 +39,9 @@ def test_cameras_of_different_delays_come_group():
     """One place a camera would never do here: when the slow one's picture comes, the fast one is two further."""
     rig, seen = aligner("ab", wait_s=0.5), []
     events = [
-        (n * FRAME_S + delay_s, name, n * FRAME_S) for n in range(20) for name, delay_s in (("a", 0), ("b", 0.25))
+        (n * FRAME_S + delay_s, name, n * FRAME_S)
+        for n in range(20)
+        for name, delay_s in (("a", 0), ("b", 0.25))
     ]
     for now_s, name, taken_s in sorted(events):
         put(rig, name, taken_s, now_s)
@@ -111,7 +113,9 @@ def test_what_nobody_takes_is_bounded_and_the_newest_wins():
     for n in range(100):
         put(rig, "ab", n * FRAME_S)
     out = rig.take(99 * FRAME_S)
-    assert [round(group.by_camera["a"].taken_s / FRAME_S) for group in out] == list(range(100 - MAX_COMPLETE - 3, 100))
+    assert [round(group.by_camera["a"].taken_s / FRAME_S) for group in out] == list(
+        range(100 - MAX_COMPLETE - 3, 100)
+    )
     assert rig.counts["a"] == {"used": MAX_COMPLETE + 3, "replaced": 100 - MAX_COMPLETE - 3}
 
 

@@ -18,7 +18,12 @@ NAMES = ("left", "right")
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A calibration of two cameras, without any image."""
-    camera = {"width": 640, "height": 480, "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "dist": [0.1, 0, 0, 0, 0]}
+    camera = {
+        "width": 640,
+        "height": 480,
+        "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]],
+        "dist": [0.1, 0, 0, 0, 0],
+    }
     camera |= {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 2], "image": "{frame}.png"}
     cameras = [camera | {"name": name} for name in NAMES]
     rig = {"format": "plain-capture/1", "first_pixel_center": [0.5, 0.5], "up": [0, -2, 0], "frames": ["0"]}
@@ -54,7 +59,12 @@ def test_a_rig_is_read(folder):
     assert (rig.name, rig.fps, rig.wait_s, rig.up.tolist()) == (folder.name, 30, 0.1, [0, -1, 0])
     assert rig.tolerance_s == pytest.approx(1 / 60)
     assert (right.name, right.url, right.format, right.offset_s) == ("right", "/dev/video2", "v4l2", -0.02)
-    assert (left.url, left.format, left.clock, left.is_file) == ("rtsp://10.0.0.7/stream", None, "arrival", False)
+    assert (left.url, left.format, left.clock, left.is_file) == (
+        "rtsp://10.0.0.7/stream",
+        None,
+        "arrival",
+        False,
+    )
     assert not left.calibration.dist[1:].any() and left.calibration.dist[0] == 0.1
 
 
@@ -63,7 +73,10 @@ def test_files_lie_beside_the_rig_and_pictures_are_made_smaller(folder):
     camera = rig.cameras[0]
     assert camera.url == str(folder / "take/video/left.mp4") and camera.is_file
     assert camera.plate == folder / "plates/left.png"
-    assert camera.taken_px == (640, 480) and (camera.calibration.width, camera.calibration.height) == (320, 240)
+    assert camera.taken_px == (640, 480) and (camera.calibration.width, camera.calibration.height) == (
+        320,
+        240,
+    )
     assert np.allclose(camera.calibration.K, [[250, 0, 160], [0, 250, 120], [0, 0, 1]])
 
 
@@ -74,7 +87,9 @@ def test_the_calibration_may_be_named_by_its_file(folder):
 
 def test_masks_are_made_by_the_person_network_unless_the_file_says_otherwise(folder):
     cameras = "".join(f'[[cameras]]\nname = "{name}"\nurl = "{name}.mp4"\n' for name in NAMES)
-    assert {camera.mask.method for camera in read(folder, f'calibration = "take"\n{cameras}').cameras} == {"person"}
+    assert {camera.mask.method for camera in read(folder, f'calibration = "take"\n{cameras}').cameras} == {
+        "person"
+    }
 
 
 ONE = '[[cameras]]\nname = "left"\nurl = "a.mp4"\n'
@@ -95,7 +110,10 @@ HEAD = 'calibration = "take"\n[mask]\nmethod = "plate"\n'
         (HEAD + ONE + ONE.replace("left", "middle"), "cameras that"),
         (HEAD + ONE + ONE.replace("left", "right").replace("a.mp4", "ftp://x/y"), "expected a url of rtsp"),
         (HEAD + ONE + ONE.replace("left", "right") + "options = {a = 1}", "options: expected a text, got "),
-        (HEAD.replace("plate", "magic") + ONE + ONE.replace("left", "right"), "mask: method: expected person or plate"),
+        (
+            HEAD.replace("plate", "magic") + ONE + ONE.replace("left", "right"),
+            "mask: method: expected person or plate",
+        ),
         (HEAD + 'plates = "all.png"\n' + ONE + ONE.replace("left", "right"), "a path with {camera} in it"),
         (rig_text(NAMES, calibration='"nowhere"'), "there is no such folder; check the path"),
     ],
@@ -108,7 +126,9 @@ def test_each_mistake_is_one_line(folder, text, said):
 
 def test_a_clean_plate_must_be_the_cameras(folder, ball_rig):
     camera = read(folder, rig_text(NAMES)).cameras[0]
-    with pytest.raises(CaptureError, match=r"left\.png: the clean plate of camera 'left': expected a readable file"):
+    with pytest.raises(
+        CaptureError, match=r"left\.png: the clean plate of camera 'left': expected a readable file"
+    ):
         mask_maker(camera)
     shutil.copytree(ball_rig / "plates", folder / "plates")
     (folder / "plates/c0.png").rename(folder / "plates/left.png")

@@ -62,7 +62,9 @@ def test_videos_as_if_live_are_masked_and_together_and_shown(rig):
         lines = get(f"{server.url}/metrics")[2].decode().splitlines()
         assert 'viewmend_camera_up{camera="c0"} 1' in lines
         assert any(line.startswith("viewmend_cameras_apart_seconds 0.0") for line in lines)
-        assert any(line.startswith('viewmend_camera_pictures_total{camera="c4",event="used"}') for line in lines)
+        assert any(
+            line.startswith('viewmend_camera_pictures_total{camera="c4",event="used"}') for line in lines
+        )
 
 
 def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):

@@ -98,7 +98,9 @@ def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
     turned = set_matrix(write_film(tmp_path / "b.mp4", frames), "turned by 90 degrees")
     shown = []
     for path in (upright, turned):
-        with closing(read_pictures(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)) as played:
+        with closing(
+            read_pictures(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)
+        ) as played:
             shown.append(to_rgb(next(played).frame))
     assert (np.rot90(shown[0], -1) == shown[1]).all()
 
@@ -150,14 +152,22 @@ def test_a_driver_that_keeps_the_kernels_time_is_believed(clock, monkeypatch):
 
 def test_a_picture_of_the_same_time_is_counted_once():
     times, counts = ArrivalTimes(), Counter()
-    assert [times.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [True, False, True, True, True]
+    assert [times.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
     assert counts["duplicated"] == 1
 
 
 def test_what_is_built_on_a_torn_picture_waits_for_a_key_picture():
     counts = Counter()
     damage = DamageFilter(counts)
-    assert not damage.accepts(frame_of(0, corrupt=True), False, 0.0) and not counts["torn"], "entered in its middle"
+    assert not damage.accepts(frame_of(0, corrupt=True), False, 0.0) and not counts["torn"], (
+        "entered in its middle"
+    )
     assert damage.accepts(frame_of(0, key=True), False, 0.1)
     assert not damage.accepts(frame_of(0, corrupt=True), False, 0.2)
     assert not damage.accepts(frame_of(0), False, 0.3)
@@ -172,7 +182,9 @@ def transport_stream(pictures_rgb):
 
     file = BytesIO()
     with av.open(file, "w", format="mpegts") as container:
-        stream = container.add_stream("libx264", rate=FPS, options={"g": "5", "crf": "10", "tune": "zerolatency"})
+        stream = container.add_stream(
+            "libx264", rate=FPS, options={"g": "5", "crf": "10", "tune": "zerolatency"}
+        )
         stream.height, stream.width, stream.pix_fmt = *pictures_rgb[0].shape[:2], "yuv420p"
         for rgb in pictures_rgb:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))

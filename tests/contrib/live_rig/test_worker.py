@@ -95,7 +95,9 @@ def test_a_slow_mask_costs_pictures_and_never_delay(camera):
     def images(picture):
         go_on.wait(WAIT_S)
 
-    with working(camera, connect, lambda name, taken_s, _: delivered.append(taken_s), _images=images) as worker:
+    with working(
+        camera, connect, lambda name, taken_s, _: delivered.append(taken_s), _images=images
+    ) as worker:
         wait_until(lambda: 49.0 in delivered)
     assert len(delivered) <= 2 and worker.counts["replaced"] == 50 - len(delivered)
 

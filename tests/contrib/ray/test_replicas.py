@@ -25,7 +25,20 @@ from viewmend.models.smooth_fill import SmoothFill
 from viewmend.stream import StreamConfig
 
 TOKEN = "a token, long enough"
-SMALL = ["--port", "0", "--size", "96", "--cameras", "4", "--frames", "2", "--model", "nearest", "--token", TOKEN]
+SMALL = [
+    "--port",
+    "0",
+    "--size",
+    "96",
+    "--cameras",
+    "4",
+    "--frames",
+    "2",
+    "--model",
+    "nearest",
+    "--token",
+    TOKEN,
+]
 HAS_IT = {"Authorization": f"Bearer {TOKEN}"}
 
 
@@ -58,7 +71,10 @@ def test_a_local_cluster_has_a_token_and_sends_no_reports(monkeypatch):
     assert "RAY_AUTH_TOKEN" not in os.environ and os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert cluster.find_ray(cluster.LOCAL) is ray
     assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) >= 32
-    assert os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0" and cluster.AS_URGENT.items() <= os.environ.items()
+    assert (
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0"
+        and cluster.AS_URGENT.items() <= os.environ.items()
+    )
 
 
 def test_a_cluster_on_which_serve_runs_is_refused():
@@ -72,7 +88,12 @@ def test_a_cluster_on_which_serve_runs_is_refused():
 
 def test_replicas_of_one_machine_share_its_memory():
     def served(most):
-        served_by = {"open_source": dict, "load_inpainter": dict, "server": ServerConfig(), "stream": StreamConfig()}
+        served_by = {
+            "open_source": dict,
+            "load_inpainter": dict,
+            "server": ServerConfig(),
+            "stream": StreamConfig(),
+        }
         return ManyViewers(**served_by, device="cpu", replicas=(1, most), store_mb=1000.0)
 
     assert 2 * served(2).replica_mb == pytest.approx(400.0) and served(100).replica_mb == served(8).replica_mb
@@ -86,7 +107,11 @@ async def ask(app, path, query=b"", headers=()):
     """Status and body, without a socket."""
     sent = []
     scope = {"type": "http", "method": "GET", "path": path, "query_string": query, "http_version": "1.1"}
-    scope |= {"headers": [(b"host", b"127.0.0.1:8008"), *headers], "server": ("127.0.0.1", 8008), "root_path": ""}
+    scope |= {
+        "headers": [(b"host", b"127.0.0.1:8008"), *headers],
+        "server": ("127.0.0.1", 8008),
+        "root_path": "",
+    }
 
     async def send(message):
         sent.append(message)
@@ -105,7 +130,9 @@ async def test_token_and_origin_are_checked_behind_a_proxy_which_has_connection_
 
     source = PushSource()
     service = RenderService(Renderer(source, SmoothFill(), PIPELINE), source)
-    open_app, app = (StartWhenReady(LiveServer(service, ServerConfig(token=t)).app(), ready) for t in (None, TOKEN))
+    open_app, app = (
+        StartWhenReady(LiveServer(service, ServerConfig(token=t)).app(), ready) for t in (None, TOKEN)
+    )
     status, body = await ask(open_app, "/")
     assert status == 200 and b"viewmend" in body
     assert (await ask(app, "/health"))[0] == 401
@@ -170,8 +197,20 @@ def test_a_viewer_reconnects_when_its_replica_is_killed():
 def test_an_unusable_source_is_the_same_error_as_without_ray(tmp_path):
     pytest.importorskip("ray", reason="Ray is not installed")
     (tmp_path / "empty").mkdir()
-    command = [sys.executable, "-m", "viewmend", "serve", str(tmp_path / "empty"), "--ray", "local", "--port", "0"]
+    command = [
+        sys.executable,
+        "-m",
+        "viewmend",
+        "serve",
+        str(tmp_path / "empty"),
+        "--ray",
+        "local",
+        "--port",
+        "0",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
-    alone = subprocess.run([*command[:-4], "--port", "0"], capture_output=True, text=True, timeout=60, check=False)
+    alone = subprocess.run(
+        [*command[:-4], "--port", "0"], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == alone.returncode == 2 and alone.stderr.strip()
     assert done.stderr == alone.stderr

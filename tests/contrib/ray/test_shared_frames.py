@@ -54,7 +54,11 @@ def test_arrays_are_not_copied():
     places = {np.frombuffer(buffer, np.uint8).ctypes.data for buffer in buffers}
     for before, after in zip(tensors_of(shared), tensors_of(got), strict=True):
         assert torch.equal(before, after) and after.data_ptr() in places
-    assert got.frame.time == 3 and got.frame.cameras.names == CAMERAS.names and got.size_bytes == shared.size_bytes
+    assert (
+        got.frame.time == 3
+        and got.frame.cameras.names == CAMERAS.names
+        and got.size_bytes == shared.size_bytes
+    )
 
 
 def test_a_stream_has_nothing_left_to_compute():
@@ -63,7 +67,9 @@ def test_a_stream_has_nothing_left_to_compute():
     got = send(ball_frame(model))[0].cached
     assert torch.equal(own.proxy.mesh.vertices, got.proxy.mesh.vertices)
     assert torch.equal(own.depth(CAMERAS.names), torch.stack([got.depths[name] for name in CAMERAS.names]))
-    model.encode_cameras(own.context(CAMERAS.names), ContextProvider(lambda *_: None, memory=lambda _: own.encoded))
+    model.encode_cameras(
+        own.context(CAMERAS.names), ContextProvider(lambda *_: None, memory=lambda _: own.encoded)
+    )
     assert own.encoded.keys() == got.encoded.keys() and len(got.encoded) == 2 * len(CAMERAS)
 
 
@@ -136,7 +142,9 @@ def follow():
 def carved(monkeypatch):
     """The frames whose hulls were carved."""
     frames, carve = [], shared_frame.cache_frame
-    monkeypatch.setattr(shared_frame, "cache_frame", lambda *given: frames.append(given[0].time) or carve(*given))
+    monkeypatch.setattr(
+        shared_frame, "cache_frame", lambda *given: frames.append(given[0].time) or carve(*given)
+    )
     return frames
 
 
@@ -228,7 +236,9 @@ def test_all_followers_of_the_edge_get_the_same_frames_however_slow_carving_is(f
             frames.append(int(follower.edge))
         clock.advance(0.2)  # six frames
         led = link.ingest._led
-        wait_until(lambda led=led: link.ingest._led > led or any(f.read(int(f.edge)) is None for f in followers))
+        wait_until(
+            lambda led=led: link.ingest._led > led or any(f.read(int(f.edge)) is None for f in followers)
+        )
         wait_until(lambda led=led: link.ingest._led > led)
     source.stop()
     assert shown[0] == shown[1], "both show the frames that were prepared"

@@ -8,4 +8,6 @@ from viewmend.models.views import prediction
 
 @pytest.fixture(autouse=True)
 def remains_stay(monkeypatch):
-    monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: torch.zeros_like(predicted))
+    monkeypatch.setattr(
+        prediction, "remains_of_phantoms", lambda colour, alpha, predicted: torch.zeros_like(predicted)
+    )

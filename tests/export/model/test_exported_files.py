@@ -40,7 +40,17 @@ def net(model):
 
 def exported(model, out):
     """What the command writes, run as users run it: the type checks of tests are not to be traced."""
-    command = [sys.executable, "-m", "viewmend", "export", str(model), "--format", out.suffix[1:], "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "viewmend",
+        "export",
+        str(model),
+        "--format",
+        out.suffix[1:],
+        "--out",
+        str(out),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert [path.name for path in out.parent.iterdir()] == [out.name]
@@ -66,7 +76,9 @@ def views(net):
 
 def nothing(given):
     """The same rig before an empty view."""
-    zeros = {name: torch.zeros_like(getattr(given, name)) for name in ("rgb", "mask", "error", "depth", "weights")}
+    zeros = {
+        name: torch.zeros_like(getattr(given, name)) for name in ("rgb", "mask", "error", "depth", "weights")
+    }
     return given._replace(**zeros)
 
 
@@ -99,8 +111,12 @@ def test_onnx_mends_as_the_model(net, network):
 
     demand_equal(net, run)
     read = onnx.load(network)
-    assert {entry.key: entry.value for entry in read.metadata_props}["outputs"] == ",".join(ViewOutputs._fields)
-    shapes = {own.name: [axis.dim_param for axis in own.type.tensor_type.shape.dim] for own in read.graph.input}
+    assert {entry.key: entry.value for entry in read.metadata_props}["outputs"] == ",".join(
+        ViewOutputs._fields
+    )
+    shapes = {
+        own.name: [axis.dim_param for axis in own.type.tensor_type.shape.dim] for own in read.graph.input
+    }
     assert shapes["rgb"][1:] == ["height", "width"] and shapes["masks"] == ["camera", "rows", "columns"]
 
 
@@ -119,12 +135,19 @@ def test_riftcasts_call_mends_holes_alone_bottom_up(net, package, program, tmp_p
     view = holed(view)
     view = replace(view, error=view.holes.float())
     given = ViewInputs.of(view, context, net.config.num_views)
-    image = torch.where(view.mask > 0, view.rgb, 1.0)  # upon white, and four channels: as it is rendered there
+    image = torch.where(
+        view.mask > 0, view.rgb, 1.0
+    )  # upon white, and four channels: as it is rendered there
     shown = (torch.cat([image, torch.ones_like(image[:1])]) * 255).round().byte()
-    more = {"image": shown.movedim(0, 2).flip(0).contiguous(), "missing": view.error[..., None].flip(0).contiguous()}
+    more = {
+        "image": shown.movedim(0, 2).flip(0).contiguous(),
+        "missing": view.error[..., None].flip(0).contiguous(),
+    }
     del (tensors := given._asdict())["rgb"], tensors["error"]
     write_tensors(tmp_path / "view.safetensors", tensors | more, {})
-    done = ran(program.with_name("inpaint"), package, tmp_path / "view.safetensors", tmp_path / "out.safetensors")
+    done = ran(
+        program.with_name("inpaint"), package, tmp_path / "view.safetensors", tmp_path / "out.safetensors"
+    )
     assert done.returncode == 0, done.stderr
     got = load_file(tmp_path / "out.safetensors")["inpainted"].flip(0).movedim(2, 0)
     right = view.error == 0
@@ -134,7 +157,9 @@ def test_riftcasts_call_mends_holes_alone_bottom_up(net, package, program, tmp_p
 
 
 def ran(program, *paths):
-    return subprocess.run([str(program), *map(str, paths)], capture_output=True, text=True, check=False, env=os.environ)
+    return subprocess.run(
+        [str(program), *map(str, paths)], capture_output=True, text=True, check=False, env=os.environ
+    )
 
 
 def test_the_example_in_cpp_mends_as_the_model(net, package, program, tmp_path):

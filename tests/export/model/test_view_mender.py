@@ -8,7 +8,13 @@ import pytest
 import torch
 from reference.random_views import holed, images, mended, random_view
 
-from viewmend.export.traceable import ExportedModel, ViewInputs, ViewOutputs, fill_any_size, pull_push_any_size
+from viewmend.export.traceable import (
+    ExportedModel,
+    ViewInputs,
+    ViewOutputs,
+    fill_any_size,
+    pull_push_any_size,
+)
 from viewmend.models.checkpoint import save_inpainter
 from viewmend.models.smooth_fill import fill, pull_push
 from viewmend.models.views.config import ViewsConfig
@@ -40,7 +46,9 @@ def test_random_views_are_mended_as_the_model_does(net, seed):
 def test_without_a_subject_the_view_stays(net):
     view, context = random_view(0, net, longest=100)
     nothing = torch.zeros_like(view.mask)
-    empty = replace(view, rgb=0 * view.rgb, mask=nothing, error=nothing, depth=nothing, weights=0 * view.weights)
+    empty = replace(
+        view, rgb=0 * view.rgb, mask=nothing, error=nothing, depth=nothing, weights=0 * view.weights
+    )
     assert not any(image.any() for image in ExportedModel(net)(*ViewInputs.of(empty, context, 4)))
 
 
@@ -59,7 +67,9 @@ def test_fills_of_any_size_are_those_of_the_coarse_fill(size):
     missing[10:40, 5:45] = True
     subject = torch.rand(size) < 0.9
     assert int(fill(rgb, missing, subject)[:, missing].isfinite().sum()) == 3 * int(missing.sum())
-    torch.testing.assert_close(fill_any_size(rgb, missing, subject), fill(rgb, missing, subject), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        fill_any_size(rgb, missing, subject), fill(rgb, missing, subject), atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(pull_push_any_size(rgb, ~missing), pull_push(rgb, ~missing), atol=1e-5, rtol=0)
     assert float(pull_push_any_size(rgb, missing & ~missing).abs().max()) == 0, "nothing is known"
 
@@ -75,7 +85,9 @@ def test_cameras_that_the_view_does_not_name_are_in_no_input_that_is_looked_at(n
     assert all(torch.equal(one, other) for one, other in zip(ExportedModel(net)(*given), again, strict=True))
     masks = given.masks.clone()
     masks[others] = 0
-    assert not torch.equal(ExportedModel(net)(*given._replace(masks=masks))[1], again[1]), "but their silhouettes are"
+    assert not torch.equal(ExportedModel(net)(*given._replace(masks=masks))[1], again[1]), (
+        "but their silhouettes are"
+    )
 
 
 def test_a_view_that_names_one_camera_is_refused(net):

@@ -22,7 +22,9 @@ def find_chromium() -> str | None:
 
 @pytest.fixture(scope="session")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install 'viewmend[dev]'")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="needs the extra: pip install 'viewmend[dev]'"
+    )
     executable = find_chromium()
     if executable is None:
         pytest.skip("no Chromium: install the system's package, or name one in VIEWMEND_CHROMIUM")
@@ -62,13 +64,13 @@ class View:
 
     def pixels(self) -> np.ndarray:
         """What a person sees, (height, width, 3) RGB."""
-        return cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+        screenshot = np.frombuffer(self.page.screenshot(), np.uint8)
+        return cv2.imdecode(screenshot, cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
     def picture(self) -> np.ndarray:
         """The canvas alone, as it is painted."""
-        hidden = (
-            "header, aside, footer, nav, .labels, .divider, .corner, .cover, .toasts { visibility: hidden !important }"
-        )
+        controls = "header, aside, footer, nav, .labels, .divider, .corner, .cover, .toasts"
+        hidden = f"{controls} {{ visibility: hidden !important }}"
         style = self.page.add_style_tag(content=hidden)
         shown = self.pixels()
         style.evaluate("e => e.remove()")

@@ -59,7 +59,9 @@ def render(camera: dict, width: int, height: int, time: int) -> tuple[np.ndarray
     """RGB (height, width, 3), z-depth (0: none), and which surface points (height, width, 3) are seen."""
     R, T = np.reshape(camera["R"], (3, 3)), np.array(camera["T"])
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    local = np.stack([(u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"], np.ones_like(u)], -1)
+    local = np.stack(
+        [(u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"], np.ones_like(u)], -1
+    )
     rays, origin = local @ R, -R.T @ T
     small = CENTER + np.array([0.75 * np.cos(0.3 * time), 0.3, 0.75 * np.sin(0.3 * time)])
     hits = np.stack([_hit(origin, rays, CENTER, BIG), _hit(origin, rays, small, SMALL)])
@@ -80,7 +82,9 @@ def picture(rgb: np.ndarray, z: np.ndarray, points: np.ndarray, mode: str) -> np
     if mode == "depth":
         return np.repeat(np.where(seen, np.clip(255 - 50 * z, 30, 255), 0)[..., None], 3, -1).astype(np.uint8)
     if mode == "coverage":
-        return np.where(seen[..., None], np.where(points[..., :1] > 0, COLOURS[0], COLOURS[1]), 0).astype(np.uint8)
+        return np.where(seen[..., None], np.where(points[..., :1] > 0, COLOURS[0], COLOURS[1]), 0).astype(
+            np.uint8
+        )
     if mode == "confidence":
         return np.where(seen[..., None], (253, 231, 36), 0).astype(np.uint8)
     if mode in ("hull", "points"):

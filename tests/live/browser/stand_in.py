@@ -25,7 +25,13 @@ from viewmend.live.responses import HEADERS, page_files
 from viewmend.live.video import STRINGS, VideoStream
 
 MODES = ["rendered", "holes", "completed", "depth", "coverage", "confidence", "hull", "points"]
-LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
+LIMITS = {
+    "max_side_px": 1024,
+    "max_pixels": 700_000,
+    "max_message_bytes": 65536,
+    "messages_per_s": 240,
+    "viewers": 4,
+}
 
 
 @dataclass
@@ -82,7 +88,12 @@ class StandIn:
         routes += [Route("/turntable", self._turntable), Route("/frame.jpg", self._scored)]
         routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
         config = uvicorn.Config(
-            Starlette(routes=routes), port=0, log_config=None, log_level="error", ws="websockets-sansio", lifespan="off"
+            Starlette(routes=routes),
+            port=0,
+            log_config=None,
+            log_level="error",
+            ws="websockets-sansio",
+            lifespan="off",
         )
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
@@ -163,8 +174,19 @@ class StandIn:
         if kind == "hello":
             self.hellos.append(message)
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
-            about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
-            about |= {"error_rules": ["holes", "all", "yours"], "error_rule": "all", "background": self.ground}
+            about = {
+                "version": 1,
+                "viewer": 1,
+                "server": "stand-in",
+                "model": "none",
+                "modes": MODES,
+                "codecs": codecs,
+            }
+            about |= {
+                "error_rules": ["holes", "all", "yours"],
+                "error_rule": "all",
+                "background": self.ground,
+            }
             more = {"budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())
@@ -205,7 +227,12 @@ class StandIn:
     def _state(self, viewer: Seen) -> dict:
         source = {"source": self.source, "error": self.error, "model_error": self.model_error}
         span = {"first": 0, "end": self.frames, "total": self.frames, "loops": True, "kind": "recording"}
-        clock = {"time": int(viewer.time), "playing": viewer.playing, "speed": viewer.speed, "live": viewer.live}
+        clock = {
+            "time": int(viewer.time),
+            "playing": viewer.playing,
+            "speed": viewer.speed,
+            "live": viewer.live,
+        }
         return {"type": "state", **source, **span, **clock, "behind": 0, "buffering": False}
 
     def _frame(self, viewer: Seen) -> bytes:
@@ -216,7 +243,12 @@ class StandIn:
         parts, data, cameras, share = [], [], [], 0.0
         for eye, camera in enumerate(eyes):
             x, y = width / look["width"], height / look["height"]
-            lens = {"fx": camera["fx"] * x, "fy": camera["fy"] * y, "cx": camera["cx"] * x, "cy": camera["cy"] * y}
+            lens = {
+                "fx": camera["fx"] * x,
+                "fy": camera["fy"] * y,
+                "cx": camera["cx"] * x,
+                "cy": camera["cy"] * y,
+            }
             K = [lens["fx"], 0, lens["cx"], 0, lens["fy"], lens["cy"], 0, 0, 1]
             cameras.append({"K": K, "R": camera["R"], "T": camera["T"]})
             rgb, z, points = scene.render({**camera, **lens}, width, height, now)
@@ -231,7 +263,13 @@ class StandIn:
                 about, content = depth_part(z, 2)
                 parts.append({"eye": eye, **about})
                 data.append(content)
-        header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
+        header = {
+            "frame": viewer.sent,
+            "look": look["id"],
+            "sent_ms": look["sent_ms"],
+            "time": now,
+            "width": width,
+        }
         header |= {"height": height, "full": part == 1.0, "cameras": cameras, "holes": share}
         header |= {
             "source_views": scene.SOURCES,
@@ -244,7 +282,9 @@ class StandIn:
         stages = {"geometry": 8.0, "context": 4.0, "rendering": 6.0, "encode": 2.0}
         stages["inpainting"] = 30.0 + 10 * np.sin(now)
         header["stage_ms"] = {**stages, "wait": 1.0, "total": sum(stages.values()) + 1}
-        header["parts"] = [about | {"bytes": len(content)} for about, content in zip(parts, data, strict=True)]
+        header["parts"] = [
+            about | {"bytes": len(content)} for about, content in zip(parts, data, strict=True)
+        ]
         return pack(header, data)
 
     def _encode(self, image: np.ndarray, codec: str) -> tuple[dict, bytes]:

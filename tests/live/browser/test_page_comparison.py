@@ -24,7 +24,9 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         view.page.keyboard.press("n")
         view.until(lambda: view.page.locator("#input-row").is_visible())
         view.page.keyboard.press("x")
-        view.until(lambda: session.newest_look is not None and session.newest_look.without == (NAME,), SCREENSHOT_S)
+        view.until(
+            lambda: session.newest_look is not None and session.newest_look.without == (NAME,), SCREENSHOT_S
+        )
         view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
         assert texts(view, "left-name", "right-name") == ["views", "Original"]
         asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={NAME}&without={NAME}"
@@ -32,7 +34,9 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         assert f"subject {score:.1f} dB" in view.page.locator("#error-name").inner_text()
         view.until(lambda: f"without={NAME}" in view.page.url)
         view.page.get_by_role("button", name="Use all cameras").click()
-        view.until(lambda: session.newest_look is not None and session.newest_look.without == (), SCREENSHOT_S)
+        view.until(
+            lambda: session.newest_look is not None and session.newest_look.without == (), SCREENSHOT_S
+        )
         view.until(lambda: view.page.locator("#error-name").is_hidden())
 
 
@@ -40,7 +44,9 @@ def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
     with opened(browser, ball, query="?time=0&mode=split&left=original&right=completed") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
         view.page.keyboard.press("n")
-        view.until(lambda: view.page.locator("#original-image").evaluate("i => i.complete && i.naturalWidth > 0"))
+        view.until(
+            lambda: view.page.locator("#original-image").evaluate("i => i.complete && i.naturalWidth > 0")
+        )
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         divider = view.page.locator("#divider").bounding_box()
         box = view.page.evaluate("Object.assign({}, document.querySelector('#divider').dataset)")
@@ -71,7 +77,9 @@ def test_two_models_are_compared(browser, ball):
         view.page.locator("#split-right").select_option("compared:paper-small")
         (session,) = ball.live.registry.sessions
         view.until(
-            lambda: session.newest_look is not None and session.newest_look.modes == ("completed", "compared"),
+            lambda: (
+                session.newest_look is not None and session.newest_look.modes == ("completed", "compared")
+            ),
             SCREENSHOT_S,
         )
         assert session.newest_look.model == "paper-small"

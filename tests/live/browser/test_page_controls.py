@@ -236,7 +236,9 @@ def test_a_label_in_the_picture_leads_to_its_camera(desktop):
     desktop.settle()
     labels = desktop.page.locator("#labels button:visible")
     names = [label.inner_text() for label in labels.all()]
-    label = next(one for one in labels.all() if 40 < one.bounding_box()["x"] < 900 and one.bounding_box()["y"] > 60)
+    label = next(
+        one for one in labels.all() if 40 < one.bounding_box()["x"] < 900 and one.bounding_box()["y"] > 60
+    )
     place = names.index(label.inner_text())
     wanted = next(c for c in scene.rig()["cameras"] if c["name"] == names[place])
     label.click()

@@ -41,7 +41,10 @@ def silent(server: Running) -> Iterator[None]:
 def drawn(view: View, time: int = 0) -> np.ndarray:
     """The canvas, once all cameras' images are there and the view rests."""
     session = view.server.live.registry.sessions
-    view.until(lambda: view.data("drawn") == str(time) and session and session[0].newest_look is not None, SCREENSHOT_S)
+    view.until(
+        lambda: view.data("drawn") == str(time) and session and session[0].newest_look is not None,
+        SCREENSHOT_S,
+    )
     view.page.wait_for_timeout(300)
     return view.picture()
 

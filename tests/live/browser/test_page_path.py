@@ -71,7 +71,9 @@ def test_own_movement_is_recorded_and_time_may_stand_still(desktop, tmp_path):
     assert set(posted["times"]) == {7}
     assert len(frames) == len(posted["poses"]) > 5
     assert frames[0].shape == (640, 640, 3)
-    way = [np.linalg.norm(eye(b) - eye(a)) for a, b in zip(posted["poses"], posted["poses"][1:], strict=False)]
+    way = [
+        np.linalg.norm(eye(b) - eye(a)) for a, b in zip(posted["poses"], posted["poses"][1:], strict=False)
+    ]
     assert sum(way) > 0.5
     assert max(way) < 0.6
 
@@ -100,7 +102,9 @@ def test_preview_goes_along_the_path_and_a_hand_stops_it(desktop):
 
 def test_a_film_that_fails_is_said(desktop):
     page = desktop.page
-    page.route("**/path.mp4", lambda route: route.fulfill(status=409, json={"error": "another film is being made"}))
+    page.route(
+        "**/path.mp4", lambda route: route.fulfill(status=409, json={"error": "another film is being made"})
+    )
     for _ in range(2):
         page.get_by_role("button", name="Add view").click()
     page.get_by_role("button", name="Export MP4").click()
@@ -159,7 +163,9 @@ def test_a_path_goes_out_as_json_for_mend_and_comes_back(desktop, tmp_path):
         np.testing.assert_allclose(eye(posted["poses"][-1]), cameras.centers[-1].numpy(), atol=1e-3)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "[[1]]", '{"points": [{"pose": "1,2", "seconds": 0, "time": 0}]}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "[[1]]", '{"points": [{"pose": "1,2", "seconds": 0, "time": 0}]}']
+)
 def test_a_file_that_is_no_path_is_said_and_changes_nothing(desktop, tmp_path, text):
     two_views(desktop.page)
     file = tmp_path / "none.json"

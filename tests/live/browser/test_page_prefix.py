@@ -56,7 +56,10 @@ def proxy(port: list[int], refused: list[str]) -> Iterator[int]:
 
 def test_everything_lies_under_the_path(browser):
     behind, refused = [0], []
-    with proxy(behind, refused) as port, running(token=TOKEN, public_url=f"http://127.0.0.1:{port}{PREFIX}") as server:
+    with (
+        proxy(behind, refused) as port,
+        running(token=TOKEN, public_url=f"http://127.0.0.1:{port}{PREFIX}") as server,
+    ):
         behind[0] = server.port
         page, asked, errors = browser.new_page(), [], []
         page.on("request", lambda request: asked.append(request.url))

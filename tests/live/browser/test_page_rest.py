@@ -62,7 +62,9 @@ def test_a_reload_shows_the_same_pose_picture_and_time(view):
     view.drag(70, 30)
     view.page.locator("#modes").get_by_role("radio", name="Holes").click()
     view.page.locator("#seek").fill("12")
-    view.until(lambda: told(view).get("time") == "12" and told(view).get("mode") == "holes" and "pose" in told(view))
+    view.until(
+        lambda: told(view).get("time") == "12" and told(view).get("mode") == "holes" and "pose" in told(view)
+    )
     before = view.server.looks[-1]
     view.page.reload()
     view.settle()

@@ -57,7 +57,14 @@ def test_a_pose_is_what_the_protocol_says(page):
 
 @pytest.mark.parametrize("roll", [0, -70, 170])
 def test_the_pose_of_a_camera_is_that_camera(page, roll):
-    pose = {"target": scene.CENTER.tolist(), "azimuth": 200, "elevation": -35, "roll": roll, "distance": 3, "fov": 40}
+    pose = {
+        "target": scene.CENTER.tolist(),
+        "azimuth": 200,
+        "elevation": -35,
+        "roll": roll,
+        "distance": 3,
+        "fov": 40,
+    }
     body = """const [rig, pose] = x, c = m.extrinsicsOf(rig, pose);
               return [c, m.extrinsicsOf(rig, m.poseOfCamera(rig, c, rig.center, 40))]"""
     there, back = call(page, "view/pose.js", body, [scene.rig(), pose])
@@ -100,7 +107,9 @@ def test_a_track_passes_its_views_and_takes_the_short_way_round(page):
     body = """const t = new m.Track(); for (const p of x) t.add(p, 7);
               return [t.at(0), t.at(2), t.at(4), t.at(1), t.moments.length, t.timeAt(3, 10, {first: 0, end: 20})]"""
     start, middle, end, between, count, time = call(page, "view/camera_path.js", body, poses)
-    assert [start["azimuth"] % 360, middle["azimuth"] % 360, end["azimuth"] % 360] == pytest.approx([350, 10, 40])
+    assert [start["azimuth"] % 360, middle["azimuth"] % 360, end["azimuth"] % 360] == pytest.approx(
+        [350, 10, 40]
+    )
     assert middle["distance"] == pytest.approx(2)
     assert -10 < (between["azimuth"] + 180) % 360 - 180 < 10
     assert count == 4 * 30 + 1

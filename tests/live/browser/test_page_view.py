@@ -77,7 +77,9 @@ def touch(view, points: list[list[tuple[float, float]]]) -> None:
     session = view.page.context.new_cdp_session(view.page)
     for n, moment in enumerate(points):
         fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(moment)]
-        session.send("Input.dispatchTouchEvent", {"type": "touchMove" if n else "touchStart", "touchPoints": fingers})
+        session.send(
+            "Input.dispatchTouchEvent", {"type": "touchMove" if n else "touchStart", "touchPoints": fingers}
+        )
         view.page.wait_for_timeout(20)
     session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
@@ -94,7 +96,11 @@ def test_one_finger_orbits_two_pan_and_pinch(browser, server):
         start, direction = eye(view), forward(view)
         touch(
             view,
-            [[(x - 40, y), (x + 40, y)], [(x - 40, y + 20), (x + 40, y + 20)], [(x - 40, y + 60), (x + 40, y + 60)]],
+            [
+                [(x - 40, y), (x + 40, y)],
+                [(x - 40, y + 20), (x + 40, y + 20)],
+                [(x - 40, y + 60), (x + 40, y + 60)],
+            ],
         )
         view.settle()
         np.testing.assert_allclose(forward(view), direction, atol=1e-5)

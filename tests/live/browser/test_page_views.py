@@ -20,7 +20,9 @@ def test_a_turntable_and_the_order_of_views(desktop):
     page.get_by_role("button", name="Turntable").click()
     desktop.until(lambda: "9 views, 4 s" in text(page), 10)
     (asked,) = desktop.server.turntables
-    assert (asked["arc"], asked["width"], asked["height"]) == ("360", "480", "480") and int(asked["frames"]) > 1
+    assert (asked["arc"], asked["width"], asked["height"]) == ("360", "480", "480") and int(
+        asked["frames"]
+    ) > 1
     assert moments(page) == [n / 2 for n in range(9)]
     desktop.server.film_hold = True
     page.get_by_role("button", name="Export MP4").click()
@@ -42,7 +44,10 @@ def test_a_turntable_and_the_order_of_views(desktop):
     assert moments(page) == [n / 2 for n in range(8)], "the moments stay"
     page.get_by_role("button", name="Go to view 2", exact=True).click()
     desktop.settle()
-    eye = -np.reshape(desktop.server.looks[-1]["camera"]["R"], (3, 3)).T @ desktop.server.looks[-1]["camera"]["T"]
+    eye = (
+        -np.reshape(desktop.server.looks[-1]["camera"]["R"], (3, 3)).T
+        @ desktop.server.looks[-1]["camera"]["T"]
+    )
     assert np.abs(eye - eyes[15]).max() < 0.05, "what was the second view of the turntable"
 
 
@@ -68,7 +73,9 @@ def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
             view.page.mouse.dblclick(x + 40, y - 30)
         view.until(lambda: "pose=" in view.page.url, SCREENSHOT_S)
         distance, target = (
-            np.array([float(value) for value in view.page.url.split("pose=")[1].split("&")[0].split(",")])[part]
+            np.array([float(value) for value in view.page.url.split("pose=")[1].split("&")[0].split(",")])[
+                part
+            ]
             for part in (3, slice(5, None))
         )
         rig = server.service.renderer.rig_json

@@ -10,7 +10,10 @@ from viewmend.live.client import Client
 from viewmend.live.server import load_extension
 from viewmend.live.video import video_codecs
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here"),
+]
 SIZE = "160x120"
 NO_SEGMENTS = "delete window.MediaSource"
 MOVES = "document.querySelector('#film').currentTime > {}"

@@ -87,7 +87,9 @@ def window_places(grid: tuple[int, int]) -> tuple[Int[Tensor, "window own"], Int
 
 def pooled_places(grid: tuple[int, int]) -> tuple[Int[Tensor, "window key"], Bool[Tensor, "window key"]]:
     """Indices of pooled tokens for each window, and which of them are in its 5 x 9 neighbourhood."""
-    (rows, near_rows), (columns, near_columns) = (_around(n, size) for n, size in zip(grid, WINDOW, strict=True))
+    (rows, near_rows), (columns, near_columns) = (
+        _around(n, size) for n, size in zip(grid, WINDOW, strict=True)
+    )
     cells = rows[:, None, :, None] * grid[1] + columns[None, :, None, :]
     near = near_rows[:, None, :, None] & near_columns[None, :, None, :]
     return cells.flatten(2).flatten(0, 1), near.flatten(2).flatten(0, 1)
@@ -170,7 +172,9 @@ class E2FGVI(nn.Module):
         """`forward`, and the completed flows of the local frames, which training compares with the true ones."""
         self.check_size(frames.shape[-2], frames.shape[-1])
         if not 1 <= local <= frames.shape[1]:
-            raise ValueError(f"expected 1 to {frames.shape[1]} local frames of {frames.shape[1]}, got {local}")
+            raise ValueError(
+                f"expected 1 to {frames.shape[1]} local frames of {frames.shape[1]}, got {local}"
+            )
         clips, flows = frames.shape[:2], self.flows(frames[:, :local])
         features = self.encoder(frames.flatten(0, 1)).unflatten(0, clips)
         consecutive = self.feat_prop_module(features[:, :local], flows.to_next, flows.to_previous)

@@ -114,7 +114,9 @@ def deform_conv2d(
     with torch.autocast(x.device.type, enabled=False):
         shift = rearrange(offsets.float(), "b (g k yx) h w -> yx (b g) k h w", k=points, yx=2)
         place = torch.arange(kernel, device=x.device) - kernel // 2
-        kernel_points = torch.stack([place.repeat(kernel), place.repeat_interleave(kernel)], -1)[:, None, None]
+        kernel_points = torch.stack([place.repeat(kernel), place.repeat_interleave(kernel)], -1)[
+            :, None, None
+        ]
         at = pixel_centers(width, height, x.device) + kernel_points + shift.flip(0).movedim(0, -1)
         images = rearrange(x.float(), "b (g c) h w -> (b g) c h w", g=groups)
         read = sample_bilinear(images, rearrange(at, "n k h w xy -> n (k h w) xy"))
@@ -168,7 +170,10 @@ class AlignedConvolution(nn.Module):
         raw = self.conv_offset(torch.cat([current, flow1, flow2], 1))
         offsets, masks = raw.float().split([2 * GROUPS * POINTS, GROUPS * POINTS], 1)
         # Flows are (right, down); the offsets of a kernel point (down, right).
-        led = [repeat(flow.flip(1), "b yx h w -> b (n yx) h w", n=GROUPS * POINTS // 2) for flow in (flow1, flow2)]
+        led = [
+            repeat(flow.flip(1), "b yx h w -> b (n yx) h w", n=GROUPS * POINTS // 2)
+            for flow in (flow1, flow2)
+        ]
         offsets = REACH_PX * offsets.tanh() + torch.cat(led, 1)
         return deform_conv2d(earlier, offsets, masks.sigmoid(), self.weight, self.bias)
 
@@ -178,7 +183,9 @@ class Propagation(nn.Module):
 
     def __init__(self, channels: int = 128) -> None:
         super().__init__()
-        self.deform_align = nn.ModuleDict({way: AlignedConvolution(channels) for way in ("backward_", "forward_")})
+        self.deform_align = nn.ModuleDict(
+            {way: AlignedConvolution(channels) for way in ("backward_", "forward_")}
+        )
         self.backbone = nn.ModuleDict(
             {
                 way: nn.Sequential(

@@ -48,13 +48,17 @@ def resized_canvas(
     return _canvas(resized(rgb, size), small, dilation_px)
 
 
-def window_canvas(rgb: Image, missing: Bool[Tensor, "height width"], size: tuple[int, int], dilation_px: int) -> Canvas:
+def window_canvas(
+    rgb: Image, missing: Bool[Tensor, "height width"], size: tuple[int, int], dilation_px: int
+) -> Canvas:
     """The view in its own resolution; one smaller than `size` gets black right and below."""
     below, right = (max(0, least - side) for least, side in zip(size, rgb.shape[1:], strict=True))
     return _canvas(pad(rgb, (0, right, 0, below)), pad(missing, (0, right, 0, below)), dilation_px)
 
 
-def windows_over(holes: Bool[Tensor, "height width"], size: tuple[int, int], overlap_px: int) -> tuple[Window, ...]:
+def windows_over(
+    holes: Bool[Tensor, "height width"], size: tuple[int, int], overlap_px: int
+) -> tuple[Window, ...]:
     """The windows of a grid that are needed for the holes.
 
     The grid has the fewest evenly spaced windows that cover the canvas with at least this overlap. It depends on sizes

@@ -49,9 +49,13 @@ class UpsampledConvolution(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, 1, 1)
 
-    def forward(self, features: Float[Tensor, "frame inputs rows cols"]) -> Float[Tensor, "frame outputs height width"]:
+    def forward(
+        self, features: Float[Tensor, "frame inputs rows cols"]
+    ) -> Float[Tensor, "frame outputs height width"]:
         """Features of twice the size."""
-        return self.conv(nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=True))
+        return self.conv(
+            nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=True)
+        )
 
 
 class FrameDecoder(nn.Sequential):
@@ -68,7 +72,9 @@ class FrameDecoder(nn.Sequential):
             nn.Conv2d(64, 3, 3, 1, 1),
         )
 
-    def forward(self, features: Float[Tensor, "frame 128 rows cols"]) -> Float[Tensor, "frame 3 height width"]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, features: Float[Tensor, "frame 128 rows cols"]
+    ) -> Float[Tensor, "frame 3 height width"]:
         """Frames of four times the size, in [-1, 1]."""
         # Not in bfloat16, where tanh near 1 has no slope: a network that outputs black could never change.
         return super().forward(features).float().tanh()
@@ -123,7 +129,9 @@ def token_grid(height: int, width: int) -> tuple[int, int]:
     return rows, cols
 
 
-def part_of(learned: Float[Tensor, "channel rows cols"], size: tuple[int, int]) -> Float[Tensor, "channel _r _c"]:
+def part_of(
+    learned: Float[Tensor, "channel rows cols"], size: tuple[int, int]
+) -> Float[Tensor, "channel _r _c"]:
     """A map learned for frames of one size; a random part of it for smaller frames in training."""
     spare = [whole - part for whole, part in zip(learned.shape[-2:], size, strict=True)]
     top, left = (int(torch.randint(n + 1, ())) if n else 0 for n in spare)

@@ -138,7 +138,9 @@ class OnlineInpainter(Inpainter):
         return OnlineState()
 
     @torch.inference_mode()
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, OnlineState]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, OnlineState]:
         """The completed view; only the variant mul uses `context`."""
         canvas = self._canvas(view)
         state = self._past(state, view.time, canvas)
@@ -147,7 +149,9 @@ class OnlineInpainter(Inpainter):
         if windows:
             frames = {view.time: canvas.image, **state.frames}
             cameras = cache(partial(self._cameras, view, context))  # fetched once for all windows
-            pieces = [self.network.complete_clip(self._clip(window, view, frames, cameras)) for window in windows]
+            pieces = [
+                self.network.complete_clip(self._clip(window, view, frames, cameras)) for window in windows
+            ]
             filled = (stitch(pieces, windows, state.canvas_px, self.config.overlap_px).float() + 1) / 2
             height, width = view.error.shape
             is_whole = self.config.framing == "def"
@@ -177,11 +181,15 @@ class OnlineInpainter(Inpainter):
         return replace(state, frames={t: frame for t, frame in state.frames.items() if t < time})
 
     def _windows_with_holes(self, view: IncompleteView, canvas: Canvas) -> list[Window]:
-        if self.config.framing == "def":  # a hole may be too thin for the small canvas, but the view still has it
+        if (
+            self.config.framing == "def"
+        ):  # a hole may be too thin for the small canvas, but the view still has it
             return [Window(0, 0)] if bool((view.error > 0).any()) else []
         return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
 
-    def _cameras(self, view: IncompleteView, context: ContextProvider, time: int) -> tuple[ContextViews, Tensor] | None:
+    def _cameras(
+        self, view: IncompleteView, context: ContextProvider, time: int
+    ) -> tuple[ContextViews, Tensor] | None:
         """The view's source cameras at a time, and their images; None if there are none, and except in mul."""
         is_mul = self.config.framing == "mul" and view.source_views
         views = context(time, view.source_views) if is_mul else None

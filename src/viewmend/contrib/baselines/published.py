@@ -48,7 +48,9 @@ def make_baseline(name: str, device: torch.device | str = "cpu") -> Inpainter:
     raise ValueError(f"expected a name like dstt-o-def, got '{name}'; the networks are {', '.join(NETWORKS)}")
 
 
-def load_baseline(network: str, weights: str = "", device: torch.device | str = "cpu") -> DSTT | FuseFormer | E2FGVI:
+def load_baseline(
+    network: str, weights: str = "", device: torch.device | str = "cpu"
+) -> DSTT | FuseFormer | E2FGVI:
     """A network of `NETWORKS` with its authors' weights (""), with ours ("-finetuned"), or with a file's ("@PATH")."""
     if weights.startswith("@"):
         path = Path(weights[1:])
@@ -62,4 +64,6 @@ def finetuned_weights(network: str) -> KnownWeights:
     """Where the weights of a network that our training fine-tuned are looked for."""
     file = f"finetuned/{network}/{TRAINED}"
     made_by = f"viewmend train {network} --from CHECKPOINT --out PLACE/finetuned/{network}"
-    return KnownWeights(f"{network}-finetuned", (file,), f"{network} as fine-tuned here", made_by, "the user's")
+    return KnownWeights(
+        f"{network}-finetuned", (file,), f"{network} as fine-tuned here", made_by, "the user's"
+    )

@@ -36,10 +36,14 @@ def dis_flow(image: Image, other: Image) -> FlowMap:
     import cv2
 
     grey = [
-        cv2.cvtColor((x.clamp(0, 1) * 255).round().byte().cpu().movedim(0, -1).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+        cv2.cvtColor(
+            (x.clamp(0, 1) * 255).round().byte().cpu().movedim(0, -1).contiguous().numpy(), cv2.COLOR_RGB2GRAY
+        )
         for x in (image, other)
     ]
-    found = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey[0], grey[1], np.zeros((0, 0)))
+    found = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
+        grey[0], grey[1], np.zeros((0, 0))
+    )
     return torch.from_numpy(np.ascontiguousarray(found)).movedim(-1, 0).to(image)
 
 
@@ -50,7 +54,9 @@ def pull(
     height, width = flow.shape[1:]
     at = pixel_centers(width, height, flow.device) + flow.movedim(0, -1)
     inside = ((at >= 0.5) & (at <= at.new_tensor([width, height]) - 0.5)).all(-1)
-    return sample_bilinear(image[None], at.flatten(0, 1)[None], "border")[0].T.unflatten(1, (height, width)), inside
+    return sample_bilinear(image[None], at.flatten(0, 1)[None], "border")[0].T.unflatten(
+        1, (height, width)
+    ), inside
 
 
 def disagreeing(flow: FlowMap, back: FlowMap) -> Bool[Tensor, "height width"]:
@@ -107,7 +113,9 @@ class Rgvi(Inpainter):
         """A stream without a past."""
         return RgviState()
 
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, State]:
         """Fills from the past along flow, the rest from the view alone; `context` is not used."""
         assert isinstance(state, RgviState), "the state of another inpainter"
         past = state.past if not state.past or state.past[0].shape == view.rgb.shape else ()

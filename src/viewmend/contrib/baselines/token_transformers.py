@@ -246,7 +246,11 @@ class FuseFormer(TokenTransformer):
 
         In training, smaller frames of multiples of 12 px are allowed; each uses a part of these maps.
         """
-        part = 0 < height <= NATIVE_PX[0] and 0 < width <= NATIVE_PX[1] and not (height % STEP_PX or width % STEP_PX)
+        part = (
+            0 < height <= NATIVE_PX[0]
+            and 0 < width <= NATIVE_PX[1]
+            and not (height % STEP_PX or width % STEP_PX)
+        )
         if (height, width) != NATIVE_PX and not (self.training and part):
             raise ValueError(
                 f"FuseFormer: expected frames of {NATIVE_PX[1]}x{NATIVE_PX[0]}, the size of its learned positions, got "

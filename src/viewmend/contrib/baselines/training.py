@@ -122,7 +122,9 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
     loss_summary = f"L1 inside and outside the holes, {ADVERSARIAL:g} x hinge loss of T-PatchGAN"
     max_grad_norm = 1e6
 
-    def __init__(self, config: TrainConfig, options: "BaselineObjectiveConfig", start: nn.Module | None) -> None:
+    def __init__(
+        self, config: TrainConfig, options: "BaselineObjectiveConfig", start: nn.Module | None
+    ) -> None:
         if not 1 <= options.clip_length <= CLIP_LENGTH:
             raise ValueError(f"expected --clip-length of 1 to {CLIP_LENGTH}, got {options.clip_length}")
         network = NETWORKS[options.network]()
@@ -138,7 +140,9 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
             options.background,
         )
         self.adversary = Adversary(Discriminator("clip", layers=6), HINGE, ADVERSARIAL, DISCRIMINATOR_RATE)
-        self.flow_teacher = deepcopy(start).requires_grad_(False).eval() if isinstance(start, E2FGVI) else None
+        self.flow_teacher = (
+            deepcopy(start).requires_grad_(False).eval() if isinstance(start, E2FGVI) else None
+        )
 
     def make_optimizer(self, parameters: list[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
         """See `Objective.make_optimizer`."""
@@ -167,7 +171,9 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
         terms = [clip_terms(frames, clip) for frames, clip in zip(made, clips, strict=True)]
         inside, outside = (torch.stack(parts).mean() for parts in zip(*terms, strict=True))
-        composed = [torch.where(c.holes[:, None], frames, c.frames) for frames, c in zip(made, clips, strict=True)]
+        composed = [
+            torch.where(c.holes[:, None], frames, c.frames) for frames, c in zip(made, clips, strict=True)
+        ]
         judged = Judged(
             [(clip.truth.transpose(0, 1) + 1) / 2 for clip in clips],
             [(frames.transpose(0, 1) + 1) / 2 for frames in composed],

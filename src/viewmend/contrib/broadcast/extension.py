@@ -54,7 +54,9 @@ class BroadcastSession(ViewerSession):
 
     def __init__(self, service: RenderService, size_px: tuple[int, int], budget_ms: float | None) -> None:
         """Begin with the page's initial view; the session is closed until `open` is called."""
-        super().__init__(lambda message: None, lambda error: None, budget_ms, service.renderer.ladder, service.now)
+        super().__init__(
+            lambda message: None, lambda error: None, budget_ms, service.renderer.ladder, service.now
+        )
         self._size_px = size_px
         self._lock = threading.Lock()
         self._is_open = False
@@ -142,7 +144,11 @@ class Broadcast(Extension):
                 self.leave(session)
                 return True
             self._director = session
-        if self._director is session and session.newest_look is not None and isinstance(message, OnAir | Look):
+        if (
+            self._director is session
+            and session.newest_look is not None
+            and isinstance(message, OnAir | Look)
+        ):
             self.session.look(session.newest_look)
         return isinstance(message, OnAir)
 
@@ -157,7 +163,9 @@ class Broadcast(Extension):
         return [
             *metric("viewmend_broadcast_watched", "gauge", "1 while it is watched.", int(self.is_watched)),
             *metric("viewmend_broadcast_files_total", "counter", "Files of the video that were sent.", sent),
-            *metric("viewmend_broadcast_bytes_total", "counter", "Bytes of the video sent.", self.counts["bytes"]),
+            *metric(
+                "viewmend_broadcast_bytes_total", "counter", "Bytes of the video sent.", self.counts["bytes"]
+            ),
         ]
 
     def routes(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
@@ -277,7 +285,9 @@ def broadcast_extension(text: str) -> ExtensionFactory:
     found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text, re.ASCII)
     size_px = (int(found[1]), int(found[2])) if found else (0, 0)
     if min(size_px) < 16 or any(side % 2 for side in size_px):
-        raise ValueError(f"expected --broadcast WIDTHxHEIGHT, even, from 16, e.g. 1280x720; got '{text[:40]}'")
+        raise ValueError(
+            f"expected --broadcast WIDTHxHEIGHT, even, from 16, e.g. 1280x720; got '{text[:40]}'"
+        )
     try:
         Limits().check_size(*size_px)
     except ValueError as error:

@@ -66,7 +66,9 @@ class HlsSegmenter:
         self._held: list[Packet] = []
         """The last packet, whose duration is not known yet."""
         open_file = partial(_File, self)
-        self._container = av.open(f"memory://{PLAYLIST}", "w", format="hls", io_open=open_file, options=MUXER_OPTIONS)
+        self._container = av.open(
+            f"memory://{PLAYLIST}", "w", format="hls", io_open=open_file, options=MUXER_OPTIONS
+        )
         stream = self._container.add_stream("libx264", rate=fps)
         assert isinstance(stream, VideoStream), "that encoder is a video's"
         width, height = size_px
@@ -102,7 +104,9 @@ class HlsSegmenter:
 
         if picture.shape[1::-1] != self._size_px:
             picture = cv2.resize(picture, self._size_px, interpolation=cv2.INTER_LINEAR)
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24").reformat(format="yuv420p")
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24").reformat(
+            format="yuv420p"
+        )
         frame.pts = at
         frame.time_base = Fraction(1, self._fps)
         second = at // self._fps

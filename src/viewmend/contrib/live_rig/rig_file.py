@@ -52,7 +52,9 @@ class RigCameraEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         scheme = re.match(r"([a-z]+)://", self.url)
         if scheme and scheme[1] not in SCHEMES:
             known = ", ".join(SCHEMES)
-            raise ValueError(f"expected a url of {known}, a device or a file, got '{self.url[:80]}'; choose one")
+            raise ValueError(
+                f"expected a url of {known}, a device or a file, got '{self.url[:80]}'; choose one"
+            )
 
 
 class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -130,9 +132,13 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
             text = file.read(MOST_BYTES)
         rig: RigFile = typed(tomllib.loads(text.decode()), RigFile)
     except OSError as error:
-        raise CaptureError(f"{path}: expected a rig's TOML file, got: {error.strerror}; check the path") from None
+        raise CaptureError(
+            f"{path}: expected a rig's TOML file, got: {error.strerror}; check the path"
+        ) from None
     except ValueError as error:  # of bytes, of TOML, of keys and values
-        what = f"expected TOML, got something else: {error}" if isinstance(error, UnicodeError) else str(error)
+        what = (
+            f"expected TOML, got something else: {error}" if isinstance(error, UnicodeError) else str(error)
+        )
         raise CaptureError(f"{path}: {what.rstrip('.')}") from None
     folder = path.resolve().parent
     calibration = _calibration(folder / rig.calibration, rig.format)
@@ -142,7 +148,9 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
         raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
     return LiveRig(
         name=rig.name or folder.name,
-        cameras=tuple(_camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras),
+        cameras=tuple(
+            _camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras
+        ),
         fps=rig.fps,
         tolerance_s=(rig.tolerance_ms or 500 / rig.fps) / 1000,
         wait_s=rig.wait_ms / 1000,
@@ -161,12 +169,18 @@ def _calibration(place: Path, format: str | None) -> NativeCalibration:
         return read_any_calibration(place, format)
     found = read_any_calibration(place.parent, format)
     if found.file.resolve() != place.resolve() and place.suffix == found.file.suffix and format is None:
-        raise CaptureError(f"{place}: expected the folder's calibration, which is {found.file.name}; name the format")
+        raise CaptureError(
+            f"{place}: expected the folder's calibration, which is {found.file.name}; name the format"
+        )
     return found
 
 
 def _camera(
-    entry: RigCameraEntry, calibration: NativeCamera, mask: MaskEntry, folder: Path, max_image_size: int | None
+    entry: RigCameraEntry,
+    calibration: NativeCamera,
+    mask: MaskEntry,
+    folder: Path,
+    max_image_size: int | None,
 ) -> LiveCamera:
     on_disk = "://" not in entry.url
     device = on_disk and DEVICE.fullmatch(entry.url)

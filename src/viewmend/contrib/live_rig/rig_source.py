@@ -127,7 +127,9 @@ class RigFileSource(LiveSource):
             CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
         """
         # workers of unchanged cameras are kept
-        unchanged = {repr(camera) for camera in rig.cameras}  # cameras hold arrays, which have no plain equality
+        unchanged = {
+            repr(camera) for camera in rig.cameras
+        }  # cameras hold arrays, which have no plain equality
         kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}
         gone = [worker for name, worker in self._workers.items() if name not in kept]
@@ -135,7 +137,9 @@ class RigFileSource(LiveSource):
         # recordings are played on one time line
         recordings = [camera for camera in rig.cameras if camera.is_file]
         if recordings:
-            self._playback.follow([video_track(camera.name, "images", Path(camera.url)) for camera in recordings])
+            self._playback.follow(
+                [video_track(camera.name, "images", Path(camera.url)) for camera in recordings]
+            )
 
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
@@ -164,7 +168,11 @@ class RigFileSource(LiveSource):
     def _begin_rig(self) -> None:
         """Announce the rig to viewers, and open its new cameras."""
         rig = self._rig
-        bounds = None if rig.bounds_m is None else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
+        bounds = (
+            None
+            if rig.bounds_m is None
+            else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
+        )
         up = None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32)
         self.begin(rig.name, rig.fps, bounds, up)
         for worker in self._new_workers:
@@ -222,7 +230,9 @@ class RigFileSource(LiveSource):
         if int(seeing) < 2:
             return None
         assert self.rig is not None, "the rig has begun"
-        capture = MemoryCapture(self.rig.name, self._cameras, (frame,), bounds=self.rig.bounds, up=self.rig.up)
+        capture = MemoryCapture(
+            self.rig.name, self._cameras, (frame,), bounds=self.rig.bounds, up=self.rig.up
+        )
         prepared = prepare(capture, align=self._align, match_colours=self._match_colours)
         for change in prepared.changes:
             log.warning("%s", change)
@@ -247,7 +257,9 @@ class RigFileSource(LiveSource):
             log.warning("the rig stays as it was: %s", error)
             return
         self._begin_rig()
-        log.warning("the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new_workers))
+        log.warning(
+            "the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new_workers)
+        )
 
     def _check_cameras(self) -> None:
         """Report an error while there are too few cameras."""

@@ -59,7 +59,9 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
     plate = read_plate(camera.plate, where)
     if plate.shape[1::-1] != camera.taken_px:
         expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
-        raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
+        raise CaptureError(
+            f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again"
+        )
     return PlateMasks(reduce_image(plate, mask_size_px(camera)))
 
 

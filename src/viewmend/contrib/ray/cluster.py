@@ -31,13 +31,20 @@ def find_ray(address: str) -> Any:
     """
     wanted = QUIET
     if address == LOCAL:
-        wanted = wanted | ON_LOOPBACK | AS_URGENT | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        wanted = (
+            wanted
+            | ON_LOOPBACK
+            | AS_URGENT
+            | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        )
     for name, value in wanted.items():
         os.environ.setdefault(name, value)
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ValueError("expected Ray for --ray, got none; install viewmend's extra 'ray', or omit --ray") from error
+        raise ValueError(
+            "expected Ray for --ray, got none; install viewmend's extra 'ray', or omit --ray"
+        ) from error
     return ray
 
 
@@ -88,7 +95,10 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Ru
                 yield task, ray.get(done)
             except ray.exceptions.RayError as error:
                 reason = " ".join(str(error).split())[:200]
-                yield task, task.failed(f"its process on the cluster died ({reason}); is there enough memory?")
+                yield (
+                    task,
+                    task.failed(f"its process on the cluster died ({reason}); is there enough memory?"),
+                )
     finally:
         if started:
             ray.shutdown()

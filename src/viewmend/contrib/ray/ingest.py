@@ -202,6 +202,8 @@ class Ingest:
         reference = self._put(shared)
         with self._changed:
             self._kept[frame.time] = PreparedFrame(source_id, reference, shared.size_bytes)
-            while len(self._kept) > 1 and sum(kept.size_bytes for kept in self._kept.values()) > self._max_bytes:
+            while (
+                len(self._kept) > 1 and sum(kept.size_bytes for kept in self._kept.values()) > self._max_bytes
+            ):
                 self._kept.popitem(last=False)
         return source_id, reference

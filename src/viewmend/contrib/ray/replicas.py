@@ -91,7 +91,9 @@ class IngestActor:
                 served = self._served
                 source = served.open_source()
                 inpainter = served.load_inpainter()
-                self._ingest = Ingest(source, inpainter, served.stream.hull, INGEST_SHARE * served.store_mb, self._put)
+                self._ingest = Ingest(
+                    source, inpainter, served.stream.hull, INGEST_SHARE * served.store_mb, self._put
+                )
                 freeze_loaded_objects()
             return self._ingest
 
@@ -256,4 +258,6 @@ def _free_port(host: str, port: int) -> int:
         with socket.create_server((host, port), family=family) as listener:
             return int(listener.getsockname()[1])
     except OSError as error:
-        raise OSError(f"port {port} of {host}: {error.strerror or error}; choose another --port or --host") from None
+        raise OSError(
+            f"port {port} of {host}: {error.strerror or error}; choose another --port or --host"
+        ) from None

@@ -33,7 +33,9 @@ class SharedSource(FrameSource):
     One thread follows the ingest's state, another one fetches frames.
     """
 
-    def __init__(self, ingest: IngestLink, memory_mb: float, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, ingest: IngestLink, memory_mb: float, now: Callable[[], float] = time.monotonic
+    ) -> None:
         """Follow an ingest; `memory_mb` bounds the frames that are kept in shared memory."""
         super().__init__(Span())
         self._ingest = ingest
@@ -122,7 +124,9 @@ class SharedSource(FrameSource):
             self.status = state.status
             span = state.span
             # Frames of a live rig that are not prepared yet cannot be requested.
-            self.span = replace(span, end=int(state.edge) + 1) if span.live and state.edge >= span.first else span
+            self.span = (
+                replace(span, end=int(state.edge) + 1) if span.live and state.edge >= span.first else span
+            )
             if self._is_edge_watched and int(state.edge) not in self._kept:
                 self._ahead = int(state.edge)
                 self._lock.notify_all()

@@ -63,7 +63,9 @@ def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> Calibrati
     covered = proxy.depth(frame.cameras) > 0
     iou = silhouette_iou(covered, frame.mask).nan_to_num(1.0).tolist()  # two empty silhouettes agree
     scores = dict(zip(frame.cameras.names, iou, strict=True))
-    return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores, diagnose(frame, bounds))
+    return CalibrationCheck(
+        frame, bounds or proxy.bounds, proxy, covered.float(), scores, diagnose(frame, bounds)
+    )
 
 
 def draw_check(check: CalibrationCheck, up: Point | None, tile_width: int = 400) -> Picture:
@@ -91,11 +93,22 @@ def _draw(check: CalibrationCheck, view: int, up: Point | None) -> Picture:
             if a is not None and b is not None:
                 cv2.line(image, a, b, colour, thickness, cv2.LINE_AA)
         if label and pixels[-1] is not None:
-            cv2.putText(image, label, pixels[-1], cv2.FONT_HERSHEY_SIMPLEX, width / 800, colour, thickness, cv2.LINE_AA)
+            cv2.putText(
+                image,
+                label,
+                pixels[-1],
+                cv2.FONT_HERSHEY_SIMPLEX,
+                width / 800,
+                colour,
+                thickness,
+                cv2.LINE_AA,
+            )
     return image
 
 
-def _lines(check: CalibrationCheck, up: Point | None) -> Iterator[tuple[Point, Point, tuple[int, int, int], str]]:
+def _lines(
+    check: CalibrationCheck, up: Point | None
+) -> Iterator[tuple[Point, Point, tuple[int, int, int], str]]:
     """The edges of the bounds, and axes and up at the centre of the subject: both ends, colour and label."""
     low = check.bounds.low
     high = check.bounds.high
@@ -114,7 +127,9 @@ def _lines(check: CalibrationCheck, up: Point | None) -> Iterator[tuple[Point, P
         yield subject.center, subject.center + 1.3 * length * up, UP, "up"
 
 
-def _visible_pixels(check: CalibrationCheck, view: int, start: Point, end: Point) -> list[tuple[int, int] | None]:
+def _visible_pixels(
+    check: CalibrationCheck, view: int, start: Point, end: Point
+) -> list[tuple[int, int] | None]:
     """Pixels along a line in the world; None where it is behind the camera or far outside the image."""
     camera = check.frame.cameras[view]
     fractions = torch.linspace(0, 1, 65)[:, None]
@@ -122,4 +137,6 @@ def _visible_pixels(check: CalibrationCheck, view: int, start: Point, end: Point
     near = 1e-3 * float((check.bounds.center - camera.centers[0]).norm())
     far = 4 * max(camera.max_size_px)
     visible = (z[0] > near) & (uv[0].abs() < far).all(-1)
-    return [(int(u), int(v)) if ok else None for (u, v), ok in zip(uv[0].tolist(), visible.tolist(), strict=True)]
+    return [
+        (int(u), int(v)) if ok else None for (u, v), ok in zip(uv[0].tolist(), visible.tolist(), strict=True)
+    ]

@@ -100,7 +100,9 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
             fault = "blurred" if bool(blurred[view]) else "noisy"
             texts[view] = f"its images are {fault} compared with the others'; check focus and gain"
     names = small.cameras.names
-    return tuple(Issue(f"camera '{names[view]}': {text}", odd_image=names[view]) for view, text in texts.items())
+    return tuple(
+        Issue(f"camera '{names[view]}': {text}", odd_image=names[view]) for view, text in texts.items()
+    )
 
 
 def find_blank_images(frame: MultiViewFrame) -> tuple[Issue, ...]:
@@ -128,7 +130,11 @@ def _find_better_fits(
     for view in suspects:
         width, height = (int(side) for side in frame.cameras.size_px[view])
         own = frame.rgb[view, :, :height, :width]
-        candidates = {"mirrored": own.flip(2), "upside down": own.flip(1), "rotated by 180 degrees": own.flip(1, 2)}
+        candidates = {
+            "mirrored": own.flip(2),
+            "upside down": own.flip(1),
+            "rotated by 180 degrees": own.flip(1, 2),
+        }
         candidates |= {
             f"as that of '{names[other]}'": frame.rgb[other, :, :height, :width]
             for other, size in enumerate(frame.cameras.size_px.tolist())
@@ -138,7 +144,9 @@ def _find_better_fits(
         images = torch.stack(list(candidates.values())).float() / 255
         sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
         shared = surface.seen[view] & surface.seen
-        distances = dict(zip(candidates, (agreement(rgb, shared, colours, view)[0] for rgb in sampled), strict=True))
+        distances = dict(
+            zip(candidates, (agreement(rgb, shared, colours, view)[0] for rgb in sampled), strict=True)
+        )
         best = min(distances, key=distances.__getitem__)
         if distances[best] < FITS * float(distance[view]):
             found[view] = best

@@ -164,7 +164,10 @@ def _agreement(
 def _explain(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Issue:
     """The change that makes hull and masks agree; if there is none, a warning, or a fatal issue without any hull."""
     tried = list(_changes(frame, bounds))
-    if max((score for score, _ in tried), default=0.0) < LEAST_IOU and len(frame.cameras) <= MAX_CAMERAS_FOR_SWAPS:
+    if (
+        max((score for score, _ in tried), default=0.0) < LEAST_IOU
+        and len(frame.cameras) <= MAX_CAMERAS_FOR_SWAPS
+    ):
         tried += list(_swaps(frame, bounds))
     best, issue = max(tried, key=lambda change: change[0], default=(0.0, Issue("")))
     if issue.camera is not None:
@@ -184,9 +187,14 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
     """Common mistakes: the IoU after each is undone, and the issue that it would be."""
     for mistake, pose in _poses(frame.cameras):
         text = f"{mistake}; cameras.json needs R and t that map world to camera in OpenCV axes: convert them"
-        yield _agreement(frame, replace(frame.cameras, camera_from_world=pose), bounds)[0], Issue(text, fatal=True)
+        yield (
+            _agreement(frame, replace(frame.cameras, camera_from_world=pose), bounds)[0],
+            Issue(text, fatal=True),
+        )
     for factor in (0.5, 2.0):
-        text = f"K is for images {factor:g} times as large; scale fx, fy, cx, cy and the skew by {1 / factor:g}"
+        text = (
+            f"K is for images {factor:g} times as large; scale fx, fy, cx, cy and the skew by {1 / factor:g}"
+        )
         K = frame.cameras.K.clone()
         K[:, :2] /= factor
         yield _agreement(frame, replace(frame.cameras, K=K), bounds)[0], Issue(text, fatal=True)

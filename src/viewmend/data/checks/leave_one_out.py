@@ -104,7 +104,9 @@ class OthersHulls:
     """The share of its own mask that lies outside the others' hull."""
 
 
-def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL) -> OthersHulls | None:
+def leave_one_out(
+    frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL
+) -> OthersHulls | None:
     """Compute a small hull without each camera in turn; None if too few cameras have any foreground."""
     names = frame.cameras.names
     mask = frame.mask
@@ -129,7 +131,9 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig
     except ValueError:  # without this camera, nothing is in front of all others
         return None
     covered = torch.stack(silhouettes)
-    return OthersHulls(covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0))
+    return OthersHulls(
+        covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0)
+    )
 
 
 def missed_share(inside: Silhouettes, covered: Silhouettes) -> Float[Tensor, "view"]:
@@ -137,7 +141,9 @@ def missed_share(inside: Silhouettes, covered: Silhouettes) -> Float[Tensor, "vi
     return (inside & ~covered).sum((1, 2)) / inside.sum((1, 2))
 
 
-def pad_like(covered: Bool[Tensor, "view _height _width"], mask: UInt8[Tensor, "_view height width"]) -> Silhouettes:
+def pad_like(
+    covered: Bool[Tensor, "view _height _width"], mask: UInt8[Tensor, "_view height width"]
+) -> Silhouettes:
     """A silhouette padded right and below with False to the size of the masks."""
     return F.pad(covered, (0, mask.shape[2] - covered.shape[2], 0, mask.shape[1] - covered.shape[1]))
 
@@ -150,7 +156,9 @@ def find_outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[
     return issues
 
 
-def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull: HullConfig) -> tuple[Issue, ...]:
+def _outlier_by_hull(
+    frame: MultiViewFrame, bounds: Bounds | None, px: int, hull: HullConfig
+) -> tuple[Issue, ...]:
     small = limit_size(frame, px)
     found = leave_one_out(small, bounds, hull)
     if found is None:
@@ -212,7 +220,9 @@ def _outlier(text: str, camera: str, leave_out: bool) -> Issue:
     return Issue(f"{text}; {advice}", timing=True)
 
 
-def find_outlier_by_outlines(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str, ...], float] | None:
+def find_outlier_by_outlines(
+    frame: MultiViewFrame, bounds: Bounds | None
+) -> tuple[tuple[str, ...], float] | None:
     """Find the camera that keeps the outlines from agreeing, and how many times smaller the residual is without it.
 
     The line of sight through a point of an outline touches the subject, so one of its points lies inside all other

@@ -8,7 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.data.checks.leave_one_out import HULL, LONGEST_PX, MIN_CAMERAS, leave_one_out, missed_share, pad_like
+from viewmend.data.checks.leave_one_out import (
+    HULL,
+    LONGEST_PX,
+    MIN_CAMERAS,
+    leave_one_out,
+    missed_share,
+    pad_like,
+)
 from viewmend.data.errors import Issue
 from viewmend.data.source import CaptureSource, limit_size
 from viewmend.geometry.bounds import Bounds
@@ -52,7 +59,9 @@ def find_desynchronised_cameras(
     return tuple(replace(issue, text=text.format(issue.text, last_id, first_id)) for issue in later)
 
 
-def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> tuple[list[MultiViewFrame], int]:
+def _frames_around(
+    source: CaptureSource, frame: MultiViewFrame, time: int
+) -> tuple[list[MultiViewFrame], int]:
     """Frames around a time, of the cameras of `frame` that all of them have, and the position of the one to judge.
 
     That is the nearest one with as many frames before as after it, if there are enough, and with a subject, if any has.
@@ -64,7 +73,9 @@ def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> t
     seen = [at for at, other in enumerate(frames) if other.has_subject]
     wanted = set(frame.cameras.names)
     middle = min(seen or [0], key=lambda at: abs(times[at] - time))
-    while middle < len(frames) - 2 and not wanted <= set(frames[-1].cameras.names):  # where some cameras have ended
+    while middle < len(frames) - 2 and not wanted <= set(
+        frames[-1].cameras.names
+    ):  # where some cameras have ended
         frames.pop()
     while middle > 1 and not wanted <= set(frames[0].cameras.names):  # or have not begun
         frames.pop(0)
@@ -81,20 +92,26 @@ def find_desynchronised_camera(
     If the masks are in sync, looks for images that are out of sync with their own masks. With `fps`, frames per second,
     delays are stated in milliseconds too.
     """
-    names = [name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)]
+    names = [
+        name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)
+    ]
     if len(names) < MIN_CAMERAS:
         return ()
     small = [limit_size(frame.select(names), LONGEST_PX) for frame in frames]
     found = leave_one_out(small[middle], bounds)
     if found is None or len(frames) < 2:
         return ()
-    shares = [missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
+    shares = [
+        missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None
+    ]
     outside = torch.stack(shares).nan_to_num(1.0)
     gain = outside[middle] - outside.amin(0)
     best = outside.argmin(0).tolist()
     views = gain.argsort(descending=True)[:MAX_DELAY_CANDIDATES].tolist()
     tried = [view for view in views if float(gain[view]) > MIN_DELAY_GAIN]
-    unexplained = {view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds) for view in tried}
+    unexplained = {
+        view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds) for view in tried
+    }
     if unexplained:
         view = min(unexplained, key=lambda view: unexplained[view])
         before = _unexplained(small[middle], bounds)
@@ -125,7 +142,9 @@ def _unexplained(frame: MultiViewFrame, bounds: Bounds | None) -> float:
         covered = reconstruct(frame.mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0
     except ValueError:
         return 1.0
-    return float(missed_share(frame.mask > FOREGROUND, pad_like(covered, frame.mask)).nanmean().nan_to_num(1.0))
+    return float(
+        missed_share(frame.mask > FOREGROUND, pad_like(covered, frame.mask)).nanmean().nan_to_num(1.0)
+    )
 
 
 def describe_delay(frames: int) -> str:
@@ -154,7 +173,9 @@ def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]
     )
 
 
-def _gradient(image: Float[Tensor, "view channel height width"]) -> Float[Tensor, "view channel 2 height width"]:
+def _gradient(
+    image: Float[Tensor, "view channel height width"],
+) -> Float[Tensor, "view channel 2 height width"]:
     """Central differences in x and y."""
     padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
     x = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]

@@ -31,7 +31,12 @@ from viewmend.data.formats import (
     zju_mocap,
 )
 from viewmend.data.formats.files import folders_containing
-from viewmend.data.native_format import CALIBRATION, NativeCalibration, calibration_from_content, read_calibration
+from viewmend.data.native_format import (
+    CALIBRATION,
+    NativeCalibration,
+    calibration_from_content,
+    read_calibration,
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,9 @@ class Format:
 _DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
 _TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
 FORMATS = {
-    module.__name__.rpartition(".")[2]: Format(module.find, module.content, getattr(module, "root", Format.root))
+    module.__name__.rpartition(".")[2]: Format(
+        module.find, module.content, getattr(module, "root", Format.root)
+    )
     for module in (transforms, colmap, *_DATA_SETS, *_TOOLS)
 }
 """All formats but our own, in the order in which they are tried."""
@@ -75,7 +82,9 @@ def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
 def _is_capture(folder: Path, names: Iterable[str], native: bool) -> bool:
     """Whether a folder that is only looked at has the files of one of these formats, or of our own."""
     try:
-        return (native and (folder / CALIBRATION).is_file()) or any(FORMATS[name].find(folder) for name in names)
+        return (native and (folder / CALIBRATION).is_file()) or any(
+            FORMATS[name].find(folder) for name in names
+        )
     except (ValueError, OSError):
         return False
 
@@ -98,7 +107,9 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
     folder does not have it, or its calibration cannot be used.
     """
     if format not in (None, *FORMAT_NAMES):
-        raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
+        raise CaptureError(
+            f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them"
+        )
     native = format in (None, "plain")
     names = [name for name in FORMATS if format in (None, name)]
     if native and (path / CALIBRATION).is_file():
@@ -116,4 +127,6 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
         raise CaptureError(f"{path}: expected a capture, got {got}; open one, such as {inner[0]}")
     if native:
         return read_calibration(path)  # its error message lists what a capture folder contains
-    raise CaptureError(f"{path}: expected a capture of format '{format}', got none of its files; see docs/formats.md")
+    raise CaptureError(
+        f"{path}: expected a capture of format '{format}', got none of its files; see docs/formats.md"
+    )

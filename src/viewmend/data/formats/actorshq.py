@@ -26,13 +26,18 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     prefix = "" if file.parent == folder else file.parent.name + "/"
     scales = [scale for scale in SCALES if prefix and (folder / scale / "calibration.csv").is_file()]
     if len(scales) > 1:
-        raise ValueError(f"expected a folder with one scale, got {', '.join(scales)}; open one of these folders")
+        raise ValueError(
+            f"expected a folder with one scale, got {', '.join(scales)}; open one of these folders"
+        )
     rows = [row for row in _read_table(file, COLUMNS) if (file.parent / "rgbs" / str(row["name"])).is_dir()]
     footage = collect_footage(file.parent, {str(row["name"]): f"rgbs/{row['name']}" for row in rows})
     entries = []
     for row in rows:
         entry = footage.entry(str(row["name"]), (row["w"], row["h"]))
-        K = [[row["fx"] * row["w"], 0.0, row["px"] * row["w"]], [0.0, row["fy"] * row["h"], row["py"] * row["h"]]]
+        K = [
+            [row["fx"] * row["w"], 0.0, row["px"] * row["w"]],
+            [0.0, row["fy"] * row["h"], row["py"] * row["h"]],
+        ]
         rotation = to_rotation(str(row["name"]), [row["rx"], row["ry"], row["rz"]])
         pose = invert_pose(np.c_[np.array(rotation), [row["tx"], row["ty"], row["tz"]]])
         paths = {key: prefix + entry[key] for key in ("image", "mask") if key in entry}
@@ -52,7 +57,11 @@ def _read_table(file: Path, columns: tuple[str, ...]) -> list[dict[str, Any]]:
         found = [{key: row[key] if key == "name" else float(row[key]) for key in columns} for row in rows]
     except (csv.Error, KeyError, TypeError) as error:
         got = f"none named {error}" if isinstance(error, KeyError) else str(error)[:60]
-        raise ValueError(f"expected columns {','.join(columns)} in {file.name}, got {got}; copy it again") from None
+        raise ValueError(
+            f"expected columns {','.join(columns)} in {file.name}, got {got}; copy it again"
+        ) from None
     if not found or any("/" in str(row.get("name", "")) for row in found):
-        raise ValueError(f"expected rows of cameras or frames in {file.name}, got none or paths; copy it again")
+        raise ValueError(
+            f"expected rows of cameras or frames in {file.name}, got none or paths; copy it again"
+        )
     return found

@@ -49,7 +49,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     chunk = max(chunks, key=lambda chunk: len(_used_cameras(chunk)), default=None)
     used = [] if chunk is None else _used_cameras(chunk)
     if chunk is None or not used:
-        raise ValueError("expected a chunk with aligned cameras, got none; align the photos and export them again")
+        raise ValueError(
+            "expected a chunk with aligned cameras, got none; align the photos and export them again"
+        )
     _warn_of_others(file, chunk, used)
     used = existing(folder, used, lambda camera: _find_image(folder, camera.get("label", "")))
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
@@ -75,7 +77,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
 
 def _used_cameras(chunk: Element) -> list[Element]:
     """The enabled cameras with a pose, of the component that has most of them: components do not share a world."""
-    posed = [camera for camera in _cameras(chunk) if _is_enabled(camera) and camera.find("transform") is not None]
+    posed = [
+        camera for camera in _cameras(chunk) if _is_enabled(camera) and camera.find("transform") is not None
+    ]
     components = Counter(camera.get("component_id") for camera in posed)
     largest = components.most_common(1)[0][0] if components else None
     return [camera for camera in posed if camera.get("component_id") == largest]
@@ -124,11 +128,17 @@ def _find_image(folder: Path, label: str) -> str:
 def _lens(name: str, sensor: Element | None) -> dict[str, Any]:
     found = [] if sensor is None else sensor.findall("calibration")
     lens = next((c for c in found if c.get("class") == "adjusted"), found[0] if found else None)
-    if lens is None or lens.get("type", "frame") != "frame" or any(_value(name, lens, key) for key in UNSUPPORTED):
+    if (
+        lens is None
+        or lens.get("type", "frame") != "frame"
+        or any(_value(name, lens, key) for key in UNSUPPORTED)
+    ):
         expected = "a calibrated frame lens with k1 to k3, p1, p2"
         raise ValueError(f"camera '{name}': expected {expected}, got another; undistort the images first")
     width, height = (int(side) for side in xml_attributes(name, lens.find("resolution"), "width height"))
-    cx, cy, k1, k2, k3, p1, p2 = (_value(name, lens, key) for key in ("cx", "cy", "k1", "k2", "k3", "p1", "p2"))
+    cx, cy, k1, k2, k3, p1, p2 = (
+        _value(name, lens, key) for key in ("cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    )
     if lens.find("f") is not None:
         f, b1, skew = (_value(name, lens, key) for key in ("f", "b1", "b2"))
         fx = f + b1
@@ -138,7 +148,12 @@ def _lens(name: str, sensor: Element | None) -> dict[str, Any]:
     else:  # before version 1.2
         fx, fy, skew = (_value(name, lens, key) for key in ("fx", "fy", "skew"))
     K = [[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    return {"width": width, "height": height, "K": K, "dist": [k1, k2, p2, p1, k3]}  # p1 and p2 are swapped in OpenCV
+    return {
+        "width": width,
+        "height": height,
+        "K": K,
+        "dist": [k1, k2, p2, p1, k3],
+    }  # p1 and p2 are swapped in OpenCV
 
 
 def _value(name: str, lens: Element, key: str) -> float:
@@ -146,7 +161,9 @@ def _value(name: str, lens: Element, key: str) -> float:
     return 0.0 if found is None else xml_number(f"camera '{name}': {key}", found.text)
 
 
-def _pose(name: str, camera: Element, chunk: Element) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+def _pose(
+    name: str, camera: Element, chunk: Element
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     """Rotation of camera_from_world and the camera's position."""
     chunk_from_camera = _numbers(name, camera.find("transform"), 16).reshape(4, 4)
     number = camera.get("component_id", "")
@@ -167,5 +184,7 @@ def _pose(name: str, camera: Element, chunk: Element) -> tuple[Float64[np.ndarra
 def _numbers(name: str, element: Element | None, count: int) -> np.ndarray:
     words = ((None if element is None else element.text) or "").split()
     if len(words) != count:
-        raise ValueError(f"camera '{name}': expected {count} numbers of its pose, got {len(words)}; export it again")
+        raise ValueError(
+            f"camera '{name}': expected {count} numbers of its pose, got {len(words)}; export it again"
+        )
     return np.array([xml_number(f"camera '{name}': pose", word) for word in words])

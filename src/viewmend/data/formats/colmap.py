@@ -66,7 +66,9 @@ def _model_in(place: Path) -> Path | None:
 
 def _read(file: Path) -> tuple[dict[int, dict[str, Any]], list[ColmapImage]]:
     """Lenses and images of a model, sorted by name."""
-    cameras, images = (bounded_bytes(path, MAX_BYTES) for path in (file, file.with_name(f"images{file.suffix}")))
+    cameras, images = (
+        bounded_bytes(path, MAX_BYTES) for path in (file, file.with_name(f"images{file.suffix}"))
+    )
     try:
         if file.suffix == ".bin":
             lenses = _binary_lenses(cameras)
@@ -75,8 +77,12 @@ def _read(file: Path) -> tuple[dict[int, dict[str, Any]], list[ColmapImage]]:
             lenses = _text_lenses(decode_text(cameras, "cameras.txt"))
             views = _text_images(decode_text(images, IMAGES))
     except (struct.error, IndexError):
-        raise ValueError("expected complete files of cameras and images, got less; export the model again") from None
-    return lenses, sorted((view._replace(name=view.name.replace("\\", "/")) for view in views), key=lambda v: v.name)
+        raise ValueError(
+            "expected complete files of cameras and images, got less; export the model again"
+        ) from None
+    return lenses, sorted(
+        (view._replace(name=view.name.replace("\\", "/")) for view in views), key=lambda v: v.name
+    )
 
 
 def _count_images(file: Path) -> int:
@@ -102,13 +108,19 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
             raise ValueError(f"expected {expected}, got none; export the model again")
         R = _rotation(view)
         t = np.array(view.t)
-        images.append(PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t))
+        images.append(
+            PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t)
+        )
     if (rig := fixed_cameras(images)) is not None:
         cameras, frames = rig
         return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
     if (moments := _count_moments(file)) > 1:
-        got = f"{moments} frames of a rig, {file.with_stem('frames').name}, in which cameras have several poses"
-        raise ValueError(f"expected a fixed rig or images of one moment, got {got}; write one model for each frame")
+        got = (
+            f"{moments} frames of a rig, {file.with_stem('frames').name}, in which cameras have several poses"
+        )
+        raise ValueError(
+            f"expected a fixed rig or images of one moment, got {got}; write one model for each frame"
+        )
     entries = []
     for image, view, name in zip(images, views, names_from_paths([view.name for view in views]), strict=True):
         pose = {"R": image.R.tolist(), "t": view.t}
@@ -187,7 +199,9 @@ def _text_lenses(text: str) -> dict[int, dict[str, Any]]:
                 height = int(words[3])
                 values = [float(word) for word in words[4:]]
             except (ValueError, IndexError):
-                raise _bad_line("cameras.txt", number, "an id, a model, a size and its parameters", line) from None
+                raise _bad_line(
+                    "cameras.txt", number, "an id, a model, a size and its parameters", line
+                ) from None
             lenses[camera] = _lens(words[1], width, height, values)
     return lenses
 
@@ -232,17 +246,23 @@ def _bad_line(file: str, number: int, expected: str, line: str) -> ValueError:
 def _parameters(model: str) -> list[str]:
     if model not in MODELS:
         expected = ", ".join(MODELS)
-        raise ValueError(f"expected a model among {expected}, got {model[:40]}; undistort the images in COLMAP first")
+        raise ValueError(
+            f"expected a model among {expected}, got {model[:40]}; undistort the images in COLMAP first"
+        )
     return MODELS[model][1].split()
 
 
 def _lens(model: str, width: int, height: int, values: list[float]) -> dict[str, Any]:
     names = _parameters(model)
     if len(values) != len(names):
-        raise ValueError(f"expected {len(names)} parameters of {model}, got {len(values)}; export the model again")
+        raise ValueError(
+            f"expected {len(names)} parameters of {model}, got {len(values)}; export the model again"
+        )
     lens = dict(zip(names, values, strict=True))
     if lens.get("k4") or lens.get("k5") or lens.get("k6"):
-        raise ValueError(f"expected {model} with k4, k5 and k6 of 0, got others; undistort the images in COLMAP first")
+        raise ValueError(
+            f"expected {model} with k4, k5 and k6 of 0, got others; undistort the images in COLMAP first"
+        )
     fx = lens.get("fx", lens.get("f"))
     fy = lens.get("fy", lens.get("f"))
     K = [[fx, 0.0, lens["cx"]], [0.0, fy, lens["cy"]], [0.0, 0.0, 1.0]]
@@ -255,7 +275,9 @@ def _rotation(view: ColmapImage) -> Float64[np.ndarray, "3 3"]:
     quaternion = np.array(view.quaternion)
     norm = np.linalg.norm(quaternion)
     if not (np.isfinite(norm) and norm > 0):
-        raise ValueError(f"expected a rotation of image '{view.name[:40]}', got {view.quaternion}; export it again")
+        raise ValueError(
+            f"expected a rotation of image '{view.name[:40]}', got {view.quaternion}; export it again"
+        )
     w, x, y, z = quaternion / norm
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 
 from viewmend.data.containers import member, names_in, open_container
-from viewmend.data.formats.files import files_like, folders_containing, image_size_px, invert_pose, to_distortion
+from viewmend.data.formats.files import (
+    files_like,
+    folders_containing,
+    image_size_px,
+    invert_pose,
+    to_distortion,
+)
 
 SUFFIX = ".smc"
 """Files of the data set have this suffix."""
@@ -22,7 +28,9 @@ def find(path: Path) -> Path | None:
     """The file with images: the path itself or its pair, or the first in the folder or in a subfolder `*main*`."""
     if path.suffix == SUFFIX and path.is_file():
         stem = path.name.removesuffix(ANNOTATIONS)
-        return path if stem == path.name else _paired(path.absolute(), f"{stem}{SUFFIX}", "annotations", "main")
+        return (
+            path if stem == path.name else _paired(path.absolute(), f"{stem}{SUFFIX}", "annotations", "main")
+        )
     return next(iter(_image_files(path)), None)
 
 
@@ -35,7 +43,9 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     """The cameras that have images and parameters, of a single sequence."""
     files = [file] if path.is_file() else _image_files(path)
     if len(files) > 1:
-        raise ValueError(f"expected one sequence, got {len(files)} in {path}; open one of them, e.g. {files[0].name}")
+        raise ValueError(
+            f"expected one sequence, got {len(files)} in {path}; open one of them, e.g. {files[0].name}"
+        )
     annotations = _annotations_of(file)
     if annotations is None:
         expected = f"{file.stem}{ANNOTATIONS} next to it or in the folder of annotations"
@@ -52,7 +62,10 @@ def content(path: Path, file: Path) -> dict[str, Any]:
             if not own:
                 continue
             frames |= own
-            entry: dict[str, Any] = {"name": f"{int(camera):02d}", "image": f"{main}/{group}/{camera}/color/{{frame}}"}
+            entry: dict[str, Any] = {
+                "name": f"{int(camera):02d}",
+                "image": f"{main}/{group}/{camera}/color/{{frame}}",
+            }
             first = entry["image"].replace("{frame}", min(own, key=int))
             entry["width"], entry["height"] = image_size_px(folder, first)
             if camera in masked:
@@ -98,12 +111,16 @@ def _parameters(annotations: Path) -> dict[str, dict[str, Any]]:
                     entry["colour"] = _numbers(camera, "Color_Calibration", 9).reshape(3, 3)[::-1].tolist()
                 found[str(int(key))] = entry
     except OSError as error:
-        raise ValueError(f"expected cameras in {annotations.name}, got: {error.strerror}; copy it again") from None
+        raise ValueError(
+            f"expected cameras in {annotations.name}, got: {error.strerror}; copy it again"
+        ) from None
     return found
 
 
 def _numbers(camera: Any, name: str, size: int) -> np.ndarray:
     data = member(camera, (name,))
     if getattr(data, "size", None) != size or data.dtype.kind not in "fiu":
-        raise ValueError(f"expected {size} numbers of {data.name[:60]}, got others; copy the annotations again")
+        raise ValueError(
+            f"expected {size} numbers of {data.name[:60]}, got others; copy the annotations again"
+        )
     return np.asarray(data[()], float).ravel()

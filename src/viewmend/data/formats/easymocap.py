@@ -40,10 +40,14 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         W = intrinsics.get(f"W_{name}")
         H = intrinsics.get(f"H_{name}")
         size = (W, H) if isinstance(W, float) and isinstance(H, float) and W and H else None
-        dist = next((intrinsics[key] for key in (f"dist_{name}", f"D_{name}") if key in intrinsics), np.zeros(5))
+        dist = next(
+            (intrinsics[key] for key in (f"dist_{name}", f"D_{name}") if key in intrinsics), np.zeros(5)
+        )
         rotation = extrinsics.get(f"Rot_{name}", extrinsics.get(f"R_{name}"))
         pose = {"R": to_rotation(name, rotation), "t": _matrix(extrinsics, f"T_{name}", 3).tolist()}
-        entries.append(footage.entry(name, size) | {"K": K.tolist(), "dist": to_distortion(name, dist)} | pose)
+        entries.append(
+            footage.entry(name, size) | {"K": K.tolist(), "dist": to_distortion(name, dist)} | pose
+        )
     bounds = [extrinsics[key] for name in names if (key := f"bounds_{name}") in extrinsics]
     return {"frames": footage.frames, "fps": footage.fps, "bounds": _union(bounds), "cameras": entries}
 

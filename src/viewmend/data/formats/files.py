@@ -34,7 +34,21 @@ LABELS = ("mask_cihp", "schp")
 NO_SUBJECT = re.compile("background|plate|empty|board|calib|intrinsic")
 """Videos with such names do not show the subject."""
 IMAGE_SUFFIXES = (
-    *(".png", ".jpg", ".jpeg", ".jpe", ".jp2", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".avif", ".gif", ".exr"),
+    *(
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".jpe",
+        ".jp2",
+        ".bmp",
+        ".dib",
+        ".tif",
+        ".tiff",
+        ".webp",
+        ".avif",
+        ".gif",
+        ".exr",
+    ),
     *(".hdr", ".pbm", ".pgm", ".ppm", ".pnm", ".ras", ".sr"),
 )
 HIDDEN = ("__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN")
@@ -77,7 +91,9 @@ def image_size_px(folder: Path, name: str) -> tuple[int, int]:
         with suppress(OSError):
             size = size_from_header(read_bytes(folder / stored_path(folder, name), HEADER_BYTES))
     if size is None:
-        raise ValueError(f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file")
+        raise ValueError(
+            f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file"
+        )
     return size
 
 
@@ -93,7 +109,9 @@ def names_of_patterns(patterns: Sequence[str]) -> list[str]:
     """A name for each camera: what its images' names share."""
     shared = [path.rpartition(".")[0].replace("{frame}", "").rstrip("_-./ ") for path in patterns]
     short = [path.rpartition("/")[2] for path in shared]
-    return short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
+    return (
+        short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
+    )
 
 
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
@@ -122,7 +140,10 @@ def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """A path with `{frame}`, and the number in which each path differs; ValueError if paths differ in several parts."""
     if len(set(paths)) == 1:
         return paths[0], ("0",) * len(paths)
-    same = [takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False)) for step in (1, -1)]
+    same = [
+        takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False))
+        for step in (1, -1)
+    ]
     before = paths[0][: len(list(same[0]))].rstrip("0123456789")
     after = len(list(same[1]))
     after = paths[0][len(paths[0]) - min(after, min(map(len, paths)) - len(before)) :].lstrip("0123456789")
@@ -145,7 +166,9 @@ def to_rotation(name: str, values: object) -> list[list[float]]:
     """A rotation matrix from its nine numbers or from a Rodrigues vector; ValueError from anything else."""
     numbers = _to_array(values)
     if numbers.size not in (3, 9):
-        raise ValueError(f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it")
+        raise ValueError(
+            f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it"
+        )
     return np.asarray(cv2.Rodrigues(numbers)[0] if numbers.size == 3 else numbers.reshape(3, 3)).tolist()
 
 
@@ -187,10 +210,16 @@ class Footage:
         """The keys of one camera; ValueError unless its images have the size that it was calibrated at, if known."""
         entry = self.entries[name]
         size = entry["width"], entry["height"]
-        if calibrated_px and any(not 0 <= a - b <= MAX_CROP_PX for a, b in zip(calibrated_px, size, strict=True)):
-            expected = " x ".join(f"{max(-1e9, min(side, 1e9)):g}" for side in calibrated_px)  # huge integers overflow
+        if calibrated_px and any(
+            not 0 <= a - b <= MAX_CROP_PX for a, b in zip(calibrated_px, size, strict=True)
+        ):
+            expected = " x ".join(
+                f"{max(-1e9, min(side, 1e9)):g}" for side in calibrated_px
+            )  # huge integers overflow
             got = f"{size[0]} x {size[1]}"
-            raise ValueError(f"camera '{name}': expected images of {expected} pixels, got {got}; export that size")
+            raise ValueError(
+                f"camera '{name}': expected images of {expected} pixels, got {got}; export that size"
+            )
         return {"name": name, **entry}
 
 
@@ -250,15 +279,22 @@ def _footage_in(folder: Path, place: str) -> Iterator[list[str]]:
 def _without_footage(folder: Path, names: Sequence[str], places: Sequence[str]) -> str:
     """The error of a folder in which fewer than two cameras have footage."""
     inner = [place for place in PLACES if place]
-    within = [*_subfolders(folder), *(f"{a}/{b}" for a in _subfolders(folder) for b in _subfolders(folder / a))]
+    within = [
+        *_subfolders(folder),
+        *(f"{a}/{b}" for a in _subfolders(folder) for b in _subfolders(folder / a)),
+    ]
     trials = [name for name in within if any((folder / name / place).is_dir() for place in inner)]
     if trials:
         return f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these"
     searched = ", ".join(place or "the folder" for place in places)
     expected = f"a video or a folder of images named after each camera ({listed(names)}) in {searched}"
     for place in places:
-        others = [f"{place}/{name}".removeprefix("/") for name in _files(folder / place) if not is_video(name)]
-        unknown = _match_some(names, [path for path in others if Path(path).suffix.lower() not in IMAGE_SUFFIXES])
+        others = [
+            f"{place}/{name}".removeprefix("/") for name in _files(folder / place) if not is_video(name)
+        ]
+        unknown = _match_some(
+            names, [path for path in others if Path(path).suffix.lower() not in IMAGE_SUFFIXES]
+        )
         if len(unknown) >= 2 and not unknown.several:
             got = listed(list(unknown.paths.values()))
             command = "ffmpeg -i FILE -c copy FILE.mp4"
@@ -292,7 +328,11 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     ids = {}
     ignored = []
     shown = {name: _videos_of_subject(folder, path) for name, path in paths.items()}
-    several = {name: found for name, found in shown.items() if len(found) > 1 and not list_images(folder, paths[name])}
+    several = {
+        name: found
+        for name, found in shown.items()
+        if len(found) > 1 and not list_images(folder, paths[name])
+    }
     if several:
         raise ValueError(_several_videos(several))
     paths = {name: shown[name][0] if len(shown[name]) == 1 else path for name, path in paths.items()}
@@ -365,7 +405,9 @@ def _one_moment(
                 entries[name][kind] = entries[name][kind].replace("{frame}", own)
     if len(set(ids.values())) > 1:
         names = ", ".join(str(entries[name]["image"]).replace("{frame}", frame) for name in list(ids)[:3])
-        warn(f"each camera has one image; they are taken as images of one moment, although their names differ: {names}")
+        warn(
+            f"each camera has one image; they are taken as images of one moment, although their names differ: {names}"
+        )
     return Footage((frame,), None, entries)
 
 
@@ -396,7 +438,9 @@ def _compare_ids(images: dict[str, frozenset[str]], masks: dict[str, frozenset[s
     spans = Counter((found[0], found[-1]) for found in numbers.values())
     if len(spans) > 1:
         (first, last), _ = spans.most_common(1)[0]
-        moved = {name: found[0] for name, found in numbers.items() if found[0] - first == found[-1] - last != 0}
+        moved = {
+            name: found[0] for name, found in numbers.items() if found[0] - first == found[-1] - last != 0
+        }
         if moved:
             warn(
                 f"the numbers of images begin at {first}, but at {', '.join(map(str, sorted(set(moved.values()))))} "
@@ -475,7 +519,9 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str,
     if not places:
         return {}
     place = next((place for place in places if _videos(folder, place) or _folders(folder, place)), places[0])
-    match = max(_match_some(names, _videos(folder, place)), _match_some(names, _folders(folder, place)), key=len)
+    match = max(
+        _match_some(names, _videos(folder, place)), _match_some(names, _folders(folder, place)), key=len
+    )
     if match.several:
         raise ValueError(f"{place}: {_several_videos(match.several)}")
     if absent := [name for name in names if name not in match.paths]:
@@ -544,7 +590,9 @@ def xml_number(what: str, text: str | None) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{what}: expected a number, got {'nothing' if not text else repr(text[:40])}; add it")
+        raise ValueError(
+            f"{what}: expected a number, got {'nothing' if not text else repr(text[:40])}; add it"
+        )
     return value
 
 

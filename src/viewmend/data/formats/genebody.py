@@ -11,7 +11,9 @@ FPS = 15.0
 
 def find(folder: Path) -> Path | None:
     """The annotations."""
-    return folder / "annots.npy" if (folder / "annots.npy").is_file() and (folder / "image").is_dir() else None
+    return (
+        folder / "annots.npy" if (folder / "annots.npy").is_file() and (folder / "image").is_dir() else None
+    )
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
@@ -24,6 +26,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     footage = collect_footage(folder, {name: f"image/{name}" for name in used})
     entries = []
     for name, camera in used.items():
-        lens = {"K": numbers(camera.get("K"), 3, 3).tolist(), "dist": to_distortion(name, numbers(camera.get("D"), 5))}
+        lens = {
+            "K": numbers(camera.get("K"), 3, 3).tolist(),
+            "dist": to_distortion(name, numbers(camera.get("D"), 5)),
+        }
         entries.append(footage.entry(name) | lens | invert_pose(numbers(camera.get("c2w"), 4, 4)))
     return {"up": [0.0, -1.0, 0.0], "fps": FPS, "frames": footage.frames, "cameras": entries}

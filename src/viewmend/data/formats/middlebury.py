@@ -22,7 +22,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     lines = [line.split() for line in text.splitlines() if line.strip()]
     wrong = [words for words in lines[1:] if len(words) != 1 + NUMBERS]
     if not lines or wrong or lines[0] != [str(len(lines) - 1)]:
-        got = f"{len(wrong[0]) - 1} after {wrong[0][0][:40]!r}" if wrong else f"{max(0, len(lines) - 1)} lines"
+        got = (
+            f"{len(wrong[0]) - 1} after {wrong[0][0][:40]!r}" if wrong else f"{max(0, len(lines) - 1)} lines"
+        )
         expected = f"a count, then that many lines of a name and {NUMBERS} numbers"
         raise ValueError(f"expected {expected}, got {got}; copy it again")
     entries = []

@@ -60,7 +60,9 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
         masks = [mask for index in group if (mask := images[index].mask) is not None]
         mask = _completed(_pattern(masks)[0], ids) if len(masks) == len(group) else None
         pose = _mean_pose([images[index] for index in group])
-        cameras.append({"name": name, **images[group[0]].lens, **pose, "image": _completed(pattern, ids), "mask": mask})
+        cameras.append(
+            {"name": name, **images[group[0]].lens, **pose, "image": _completed(pattern, ids), "mask": mask}
+        )
     return cameras, tuple(ids)
 
 

@@ -73,6 +73,8 @@ def _resize(K: tuple[Triple, ...], full: tuple[int, int], size: tuple[int, int])
     sy = size[1] / full[1]
     if abs(sx - sy) > 1 / min(full):
         got = f"{size[0]} x {size[1]}"
-        raise ValueError(f"expected images of the shape of {full[0]} x {full[1]}, got {got}; do not crop them")
+        raise ValueError(
+            f"expected images of the shape of {full[0]} x {full[1]}, got {got}; do not crop them"
+        )
     (fx, skew, cx), (_, fy, cy), _ = K
     return [[fx * sx, skew * sx, (cx + 0.5) * sx], [0.0, fy * sy, (cy + 0.5) * sy], [0.0, 0.0, 1.0]]

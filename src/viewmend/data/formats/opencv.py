@@ -99,8 +99,14 @@ def _calibration(name: str, values: dict[str, Any]) -> dict[str, Any]:
     t = np.asarray(values.get("t", []))
     if K.size != 9 or t.size != 3:
         got = f"{K.size} and {t.size}"
-        raise ValueError(f"camera '{name}': expected a matrix of 9 numbers and a translation of 3, got {got}; add them")
-    entry = {"K": K.reshape(3, 3).tolist(), "t": t.ravel().tolist(), "R": to_rotation(name, values.get("R", []))}
+        raise ValueError(
+            f"camera '{name}': expected a matrix of 9 numbers and a translation of 3, got {got}; add them"
+        )
+    entry = {
+        "K": K.reshape(3, 3).tolist(),
+        "t": t.ravel().tolist(),
+        "R": to_rotation(name, values.get("R", [])),
+    }
     return entry | {"dist": to_distortion(name, values.get("dist", []))}
 
 
@@ -164,6 +170,10 @@ def _matrix(key: str, stored: dict[str, Any]) -> np.ndarray:
 def _number(value: object) -> float | None:
     """A number from its text, including YAML's `.Inf` and `.Nan`; None if it is invalid."""
     try:
-        return float(value.lower().replace(".inf", "inf").replace(".nan", "nan")) if isinstance(value, str) else None
+        return (
+            float(value.lower().replace(".inf", "inf").replace(".nan", "nan"))
+            if isinstance(value, str)
+            else None
+        )
     except ValueError:
         return None

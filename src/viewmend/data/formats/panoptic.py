@@ -61,5 +61,7 @@ def _footage(folder: Path, kind: str, name: str) -> str | None:
     if (folder / f"{kind}Imgs" / name).is_dir():
         return f"{kind}Imgs/{name}"
     videos = folder / f"{kind}Videos"
-    found = next(iter(sorted((*videos.glob(f"{kind}_{name}.mp4"), *videos.glob(f"*/{kind}_{name}.mp4")))), None)
+    found = next(
+        iter(sorted((*videos.glob(f"{kind}_{name}.mp4"), *videos.glob(f"*/{kind}_{name}.mp4")))), None
+    )
     return None if found is None else str(found.relative_to(folder))

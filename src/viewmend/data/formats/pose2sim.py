@@ -27,10 +27,16 @@ def find(folder: Path) -> Path | None:
     """The calibration, in the folder or in one with "calib" in its name."""
     for place in folders_containing(folder, "calib"):
         named = [path for path in files_like(place, "*.toml") if NAMES.fullmatch(path.name)]
-        counts = {path: len(re.findall(rb"(?m)^matrix\s*=", bounded_bytes(path, MAX_BYTES))) for path in named}
-        usable = sorted((path for path in named if counts[path]), key=lambda path: (-counts[path], len(path.name)))
+        counts = {
+            path: len(re.findall(rb"(?m)^matrix\s*=", bounded_bytes(path, MAX_BYTES))) for path in named
+        }
+        usable = sorted(
+            (path for path in named if counts[path]), key=lambda path: (-counts[path], len(path.name))
+        )
         if usable[1:]:
-            warn(f"{usable[0]}: this calibration is used, and not {', '.join(path.name for path in usable[1:])}")
+            warn(
+                f"{usable[0]}: this calibration is used, and not {', '.join(path.name for path in usable[1:])}"
+            )
         if usable:
             return usable[0]
     return None
@@ -50,13 +56,19 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     entries = []
     for name, table in ((name, table) for name, table in cameras if name in footage):
         if table.get("fisheye"):
-            raise ValueError(f"camera '{name}': expected a lens without fisheye, got one; undistort the images first")
+            raise ValueError(
+                f"camera '{name}': expected a lens without fisheye, got one; undistort the images first"
+            )
         size = table.get("size")
-        if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int | float) for side in size)):
+        if not (
+            isinstance(size, list) and len(size) == 2 and all(isinstance(side, int | float) for side in size)
+        ):
             raise ValueError(f"camera '{name}': expected size = [width, height], got others; add it")
         entry = footage.entry(name, [float(side) for side in size])
         entry |= {"K": table["matrix"], "dist": to_distortion(name, table.get("distortions", []))}
-        entries.append(entry | {"R": to_rotation(name, table.get("rotation", [])), "t": table.get("translation")})
+        entries.append(
+            entry | {"R": to_rotation(name, table.get("rotation", [])), "t": table.get("translation")}
+        )
     synchronized = any(str(entry.get("video", "")).startswith("synchronized_videos/") for entry in entries)
     unit = MILLIMETRES if synchronized else 1.0
     return {"metres_per_unit": unit, "frames": footage.frames, "fps": footage.fps, "cameras": entries}

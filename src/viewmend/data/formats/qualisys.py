@@ -38,7 +38,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
 def _calibration(name: str, camera: Element) -> dict[str, Any]:
     intrinsic = camera.find("intrinsic")
     transform = camera.find("transform")
-    fx, fy, cx, cy, skew = xml_attributes(name, intrinsic, "focalLengthU focalLengthV centerPointU centerPointV skew")
+    fx, fy, cx, cy, skew = xml_attributes(
+        name, intrinsic, "focalLengthU focalLengthV centerPointU centerPointV skew"
+    )
     k1, k2, k3 = xml_attributes(name, intrinsic, "radialDistortion1 radialDistortion2 radialDistortion3")
     p1, p2 = xml_attributes(name, intrinsic, "tangentalDistortion1 tangentalDistortion2")
     K = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, UNITS_PER_PIXEL]]) / UNITS_PER_PIXEL

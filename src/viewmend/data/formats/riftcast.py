@@ -136,7 +136,9 @@ def _pattern(folder: Path, stem: str, frames: list[str], suffixes: tuple[str, ..
 def _meta_keys(meta: MetaFile) -> dict[str, Any]:
     """The keys `up` and `bounds` from a meta file."""
     if not (meta.dataset.flip_images and meta.dataset.flip_masks):
-        raise ValueError("expected flip_images and flip_masks of true, got files stored bottom-up; flip the files")
+        raise ValueError(
+            "expected flip_images and flip_masks of true, got files stored bottom-up; flip the files"
+        )
     to_world = meta.dataset.to_world  # in the program's frame, y up
     stored = FLIP if to_world is None else FLIP @ np.array(to_world).reshape(4, 4)
     result: dict[str, Any] = {"up": stored[:3, 1].tolist()}
@@ -157,7 +159,9 @@ def _is_meta(file: Path) -> bool:
 def _read_meta(file: Path) -> MetaFile:
     meta = typed(read_json(_without_comments(bounded_bytes(file, MAX_META_BYTES))), MetaFile)
     if meta.version.partition(".")[0] != "2":
-        raise ValueError(f"expected version 2 of RIFTCast's meta file, got {meta.version[:20]!r}; write it again")
+        raise ValueError(
+            f"expected version 2 of RIFTCast's meta file, got {meta.version[:20]!r}; write it again"
+        )
     return meta
 
 

@@ -33,10 +33,42 @@ POSE_DIGITS = 6
 OTHER_MEANING = ("equirectangular", "latlong", "from_mitsuba", "ftheta_p0", "ortho_scale")
 """Keys that give images or poses another meaning if set."""
 WITHOUT_EFFECT = (
-    *("aabb_scale", "scale", "offset", "up", "applied_transform", "applied_scale", "ply_file_path", "name", "version"),
-    *("train_filenames", "val_filenames", "test_filenames", "orientation_override", "auto_scale_poses_override"),
-    *("n_extra_learnable_dims", "white_transparent", "black_transparent", "render_aabb", "sharpen", "sharpness"),
-    *("enable_depth_loading", "fix_premult", "envmap", "colmap_im_id", "rotation", "camera_angle", "fovx", "fovy"),
+    *(
+        "aabb_scale",
+        "scale",
+        "offset",
+        "up",
+        "applied_transform",
+        "applied_scale",
+        "ply_file_path",
+        "name",
+        "version",
+    ),
+    *(
+        "train_filenames",
+        "val_filenames",
+        "test_filenames",
+        "orientation_override",
+        "auto_scale_poses_override",
+    ),
+    *(
+        "n_extra_learnable_dims",
+        "white_transparent",
+        "black_transparent",
+        "render_aabb",
+        "sharpen",
+        "sharpness",
+    ),
+    *(
+        "enable_depth_loading",
+        "fix_premult",
+        "envmap",
+        "colmap_im_id",
+        "rotation",
+        "camera_angle",
+        "fovx",
+        "fovy",
+    ),
     *("fov_x", "fov_y", "fisheye_crop_radius", "normal_file_path", "semantics_path"),
     *("transform_matrix_start", "transform_matrix_end"),
 )
@@ -150,7 +182,10 @@ def _with_local_paths(folder: Path, frame: _Entry) -> _Entry:
 def _check_suffixes(folder: Path, frames: list[_Entry]) -> None:
     """ValueError for an image without suffix that was not found under any."""
     for path in (frame.file_path for frame in frames if stays_inside(frame.file_path)):
-        if PurePosixPath(path).suffix.lower() not in IMAGE_SUFFIXES and not container_of(folder / path).is_file():
+        if (
+            PurePosixPath(path).suffix.lower() not in IMAGE_SUFFIXES
+            and not container_of(folder / path).is_file()
+        ):
             expected = f"an image {path[:200]!r}, or this with an image suffix such as .png or .jpg"
             raise ValueError(f"expected {expected}, got none; add the file, or correct file_path")
 
@@ -163,7 +198,9 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
         at_pose = by_pose.setdefault(pose, {})
         if frame.time in at_pose:
             got = f"{at_pose[frame.time].file_path[:60]} and {frame.file_path[:60]} at the same"
-            raise ValueError(f"expected one image for each pose and 'time', got {got}; add 'time' to each frame")
+            raise ValueError(
+                f"expected one image for each pose and 'time', got {got}; add 'time' to each frame"
+            )
         at_pose[frame.time] = frame
     times = {frame.time for frame in frames}
     if len(times) <= 1:
@@ -172,7 +209,11 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
     cameras = []
     for at_pose in by_pose.values():
         if None in times or len(at_pose) < 2:
-            got = "frames without one" if None in times else f"only {next(iter(at_pose.values())).file_path[:60]}"
+            got = (
+                "frames without one"
+                if None in times
+                else f"only {next(iter(at_pose.values())).file_path[:60]}"
+            )
             raise ValueError(
                 f"expected a 'time' in each frame, and each camera's pose at two or more times, got {got}; add them, "
                 "or write one file for each time (a single moving camera cannot be used)"
@@ -184,9 +225,13 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
             pattern, found = frame_pattern(paths) if len(paths) == len(entries) else (None, ())
             patterns[key] = pattern
             if any(ids.setdefault(time, name) != name for time, name in zip(at_pose, found, strict=False)):
-                raise ValueError(f"expected equal numbers in {key} for equal 'time', got others; rename the files")
+                raise ValueError(
+                    f"expected equal numbers in {key} for equal 'time', got others; rename the files"
+                )
             if len(set(ids.values())) < len(ids):
-                raise ValueError(f"expected equal 'time' for equal numbers in {key}, got others; round them alike")
+                raise ValueError(
+                    f"expected equal 'time' for equal numbers in {key}, got others; round them alike"
+                )
         cameras.append((structs.replace(entries[0], **patterns), entries[0]))
     return cameras, tuple(ids[time] for time in sorted(times))  # pyright: ignore[reportArgumentType]
 
@@ -197,9 +242,13 @@ def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str
     fisheye = default.is_fisheye or frame.is_fisheye or any(lens[key] for key in ("k4", "k5", "k6"))
     if others or fisheye:
         got = str(others[0])[:40] if others else "k4 or a fisheye"
-        raise ValueError(f"expected a camera_model among {', '.join(MODELS)}, got {got}; undistort the images first")
+        raise ValueError(
+            f"expected a camera_model among {', '.join(MODELS)}, got {got}; undistort the images first"
+        )
     if any(lens["rolling_shutter"] or ()):
-        raise ValueError("expected images of one moment, got rolling_shutter; correct the images and set it to zeros")
+        raise ValueError(
+            "expected images of one moment, got rolling_shutter; correct the images and set it to zeros"
+        )
     width = lens["w"]
     height = lens["h"]
     if width is None or height is None:

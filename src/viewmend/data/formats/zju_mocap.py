@@ -18,10 +18,14 @@ def find(folder: Path) -> Path | None:
 def content(folder: Path, file: Path) -> dict[str, Any]:
     """All cameras, named after the folders of their images."""
     annotations = read_objects(file)
-    cams, ims = (annotations.get(key) for key in ("cams", "ims")) if isinstance(annotations, dict) else (None, None)
+    cams, ims = (
+        (annotations.get(key) for key in ("cams", "ims")) if isinstance(annotations, dict) else (None, None)
+    )
     lists = [_to_list(cams.get(key)) for key in ("K", "D", "R", "T")] if isinstance(cams, dict) else []
     if not lists or not isinstance(ims, list) or len({len(values) for values in lists}) != 1:
-        raise ValueError("expected lists K, D, R and T in 'cams', and 'ims', got others; is it a file of ZJU-MoCap?")
+        raise ValueError(
+            "expected lists K, D, R and T in 'cams', and 'ims', got others; is it a file of ZJU-MoCap?"
+        )
     paths = [_paths(frame, len(lists[0])) for frame in ims[:MAX_FRAMES]]
     patterns = [_pattern([frame[camera] for frame in paths]) for camera in range(len(lists[0]))]
     if not patterns or len({ids for _, ids in patterns}) != 1:
@@ -33,11 +37,20 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         images = [pattern.replace("{frame}", frame) for frame in ids]
         example = next((path for path in images if (folder / path).is_file()), images[0])
         width, height = image_size_px(folder, example)
-        entry = {"name": name, "width": width, "height": height, "image": pattern, "K": numbers(K, 3, 3).tolist()}
+        entry = {
+            "name": name,
+            "width": width,
+            "height": height,
+            "image": pattern,
+            "K": numbers(K, 3, 3).tolist(),
+        }
         entry |= {"R": numbers(R, 3, 3).tolist(), "t": numbers(T, 3).tolist()}
         entry |= {"dist": to_distortion(name, numbers(D, 5))}
         if place:
-            entry |= {"mask": f"{place}/{pattern.rpartition('.')[0]}.png", "mask_labels": place in (*LABELS, "mask")}
+            entry |= {
+                "mask": f"{place}/{pattern.rpartition('.')[0]}.png",
+                "mask_labels": place in (*LABELS, "mask"),
+            }
         entries.append(entry)
     return {"metres_per_unit": MILLIMETRES, "frames": patterns[0][1], "cameras": entries}
 
@@ -51,7 +64,9 @@ def _to_list(value: Any) -> list[Any]:
 def _paths(frame: Any, cameras: int) -> list[str]:
     found = _to_list(unwrap(frame.get("ims")) if isinstance(frame, dict) else None)
     if len(found) < cameras or not all(isinstance(path, str) and path for path in found[:cameras]):
-        raise ValueError(f"expected paths of {cameras} images in each of 'ims', got others; is it ZJU-MoCap's file?")
+        raise ValueError(
+            f"expected paths of {cameras} images in each of 'ims', got others; is it ZJU-MoCap's file?"
+        )
     return [path.replace("\\", "/") for path in found[:cameras]]
 
 

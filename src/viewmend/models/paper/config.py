@@ -56,20 +56,26 @@ class PaperConfig:
         object.__setattr__(self, "widths", tuple(self.widths))
         least = dict.fromkeys(("dim", "heads", "groups", "blocks", "ffn_ratio", "num_source_views", "k_w"), 1)
         least |= {"n_c": 0, "n_w": 0}
-        wrong = [f"{n} = {getattr(self, n)}" for n, low in least.items() if not low <= getattr(self, n) <= MAX_SIZE]
+        wrong = [
+            f"{n} = {getattr(self, n)}" for n, low in least.items() if not low <= getattr(self, n) <= MAX_SIZE
+        ]
         wrong += [f"widths of {width}" for width in self.widths if not 0 < width <= MAX_SIZE]
         wrong += [f"top_k = {self.top_k}"] if self.top_k is not None and self.top_k < 1 else []
         if wrong:
             raise ValueError(f"expected positive sizes of at most {MAX_SIZE}, got {', '.join(wrong)}")
         if self.groups * self.blocks > MAX_BLOCKS:
-            raise ValueError(f"expected at most {MAX_BLOCKS} blocks in total, got {self.groups} x {self.blocks}")
+            raise ValueError(
+                f"expected at most {MAX_BLOCKS} blocks in total, got {self.groups} x {self.blocks}"
+            )
         if self.dim % (16 * self.heads):
             raise ValueError(
                 f"expected dim to be a multiple of 16 x heads (three axes of rotated pairs), got dim {self.dim} "
                 f"with {self.heads} heads; change one of them"
             )
         if len(self.widths) != len(ENCODER_GROUPS) or any(w % 8 for w in self.widths):
-            raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
+            raise ValueError(
+                f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}"
+            )
         if self.background not in get_args(Background):
             raise ValueError(f"expected background 'black' or 'white', got {self.background!r}")
 
@@ -97,7 +103,9 @@ class PaperConfig:
         """Inverse of `to_dict`. Raises ValueError for an unknown key or an impossible value."""
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
-            raise ValueError(f"expected the keys of PaperConfig, got unknown {unknown}; use the version that wrote it")
+            raise ValueError(
+                f"expected the keys of PaperConfig, got unknown {unknown}; use the version that wrote it"
+            )
         return typed(values, cls)
 
 

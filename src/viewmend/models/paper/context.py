@@ -96,7 +96,9 @@ def collate(
     """
     queries, query_positions, keys, key_positions = [], [], [], []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
-        uvs = F.pad(centers_px(target.places) / target.view.camera.size_px[0], (0, 1))  # s = 0 in the novel view
+        uvs = F.pad(
+            centers_px(target.places) / target.view.camera.size_px[0], (0, 1)
+        )  # s = 0 in the novel view
         valid = torch.ones(len(uvs), dtype=torch.bool, device=uvs.device)
         queries.append(target.tokens[target.incomplete])
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
@@ -111,10 +113,14 @@ def collate(
     keys_values = torch.stack(joined, 2) if len(joined) > 1 else joined[0][:, :, None]  # one sample: no copy
     padded = torch.stack([_pad(q, num_queries) for q in queries])
     counts = [len(own_queries) for own_queries in queries]
-    return Batch(padded, counts, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys))
+    return Batch(
+        padded, counts, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys)
+    )
 
 
-def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:
+def _carry(
+    frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig
+) -> Positions:
     """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
     points, valid = frame.points_world, frame.valid
     if frame.time != view.time:
@@ -127,7 +133,9 @@ def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: Incomplete
 
 
 def _stack(positions: Sequence[Positions], length: int) -> TokenPositions:
-    return TokenPositions(*(torch.stack([_pad(own, length) for own in v]) for v in zip(*positions, strict=True)))
+    return TokenPositions(
+        *(torch.stack([_pad(own, length) for own in v]) for v in zip(*positions, strict=True))
+    )
 
 
 def _join(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Float[Tensor, "block 2 key dim"]:

@@ -13,7 +13,13 @@ from viewmend.models.network import Network
 from viewmend.models.paper.config import PaperConfig
 from viewmend.models.paper.context import Batch, ContextFrame, Target, collate, window_times
 from viewmend.models.paper.patches import STEP_PX, any_in_patch, centers_px, lift, merge, patch_depths
-from viewmend.models.paper.tokenizer import Decoder, EncoderInput, Tokeniser, build_context_input, build_target_input
+from viewmend.models.paper.tokenizer import (
+    Decoder,
+    EncoderInput,
+    Tokeniser,
+    build_context_input,
+    build_target_input,
+)
 from viewmend.models.paper.transformer import Transformer
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 
@@ -70,7 +76,9 @@ class PatchTransformer(Network):
         views and contexts differ.
         """
         if len(views) != len(contexts):
-            raise ValueError(f"expected one context per view, got {len(views)} views and {len(contexts)} contexts")
+            raise ValueError(
+                f"expected one context per view, got {len(views)} views and {len(contexts)} contexts"
+            )
         frames = self.encode_windows(views, contexts)
         targets = self.encode_targets(views)
         missing = [i for i, target in enumerate(targets) if bool(target.incomplete.any())]
@@ -82,7 +90,9 @@ class PatchTransformer(Network):
         return [self._predict(target, patches.get(i)) for i, target in enumerate(targets)]
 
     @torch.no_grad()
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, State]:
         """Complete a view from the cameras and frames of its window (section 9); unchanged if it has no holes."""
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
@@ -102,7 +112,9 @@ class PatchTransformer(Network):
         """Encode all of these cameras at their frame."""
         self._encoded((views.frame.time,), views.frame.cameras.names, context)
 
-    def _encoded(self, times: Sequence[int], names: Sequence[str], context: ContextProvider) -> list[ContextFrame]:
+    def _encoded(
+        self, times: Sequence[int], names: Sequence[str], context: ContextProvider
+    ) -> list[ContextFrame]:
         """These cameras in these frames, encoded now or for an earlier view."""
         return context.encoded(times, names, self.encode_contexts, self.encoding_kind)
 
@@ -117,7 +129,8 @@ class PatchTransformer(Network):
             names, times = self.source_names(view), window_times(view.time, self.config)
             kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
             kept = [
-                c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept
+                c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names)
+                for c in kept
             ]
             windows.append([c for c in kept if isinstance(c, ContextFrame) or len(c.frame.cameras)])
         images = [item for window in windows for item in window if isinstance(item, ContextViews)]
@@ -159,7 +172,9 @@ class PatchTransformer(Network):
         """RGB of each target's incomplete patches: transformer and decoder (sections 6 and 7)."""
         with self.autocast():
             tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k)
-            decoded = self.decoder(torch.cat([own[:count] for own, count in zip(tokens, batch.counts, strict=True)]))
+            decoded = self.decoder(
+                torch.cat([own[:count] for own, count in zip(tokens, batch.counts, strict=True)])
+            )
         return list(decoded.float().split(batch.counts))
 
     def _predict(self, target: Target, patches: Float[Tensor, "patch 3 28 28"] | None) -> Prediction:
@@ -170,7 +185,9 @@ class PatchTransformer(Network):
             zeros = torch.zeros_like(view.rgb)
             return Prediction(zeros, zeros[0], view.rgb, alpha, view.target_mask)
         height, width = view.mask.shape
-        (inpainted,), (coverage,) = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
+        (inpainted,), (coverage,) = merge(
+            patches, target.places[target.incomplete], (1, height, width), STEP_PX
+        )
         completed = blend(view.rgb, view.error, inpainted, coverage, clamp=False)
         return Prediction(inpainted, coverage, completed, alpha, view.target_mask)
 

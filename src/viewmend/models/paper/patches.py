@@ -75,9 +75,13 @@ def merge(patches: Patches, places: Places, shape: tuple[int, int, int], step: i
     # Pixels of patches beyond the image go to an extra place: to leave them out would wait for a device.
     flat = torch.where(inside, (places[:, 0, None, None] * height + v) * width + u, pixels).flatten()
 
-    ramp = torch.minimum(offsets + 0.5, size - (offsets + 0.5))  # falls from a patch's centre to its edges, above 0
+    ramp = torch.minimum(
+        offsets + 0.5, size - (offsets + 0.5)
+    )  # falls from a patch's centre to its edges, above 0
     weights = (ramp[:, None] * ramp / (size / 2) ** 2).to(patches).expand(len(patches), -1, -1)
-    weighted = torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1).reshape(-1, channels + 1)
+    weighted = (
+        torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1).reshape(-1, channels + 1)
+    )
     sums = weighted.new_zeros(pixels + 1, channels + 1).index_add(0, flat, weighted)[:pixels]
     total = sums.unflatten(0, (views, height, width)).movedim(-1, 1)
     weight = total[:, -1]
@@ -97,7 +101,9 @@ def crop(
     return F.pad(inside, (before, after, above, below))
 
 
-def patch_depths(depth: Planes, foreground: Bool[Tensor, "view height width"]) -> Float[Tensor, "view rows cols"]:
+def patch_depths(
+    depth: Planes, foreground: Bool[Tensor, "view height width"]
+) -> Float[Tensor, "view rows cols"]:
     """z-depth of every patch's centre, in metres (section 5).
 
     A centre is where four pixels meet; its depth is the mean of those of the four that have one. Without any, it is

@@ -10,7 +10,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.models.paper.config import ENCODER_GROUPS, PaperConfig
-from viewmend.models.paper.patches import PATCH_CELLS, STEP_CELLS, STEP_PX, any_in_patch, crop, padded_size, split
+from viewmend.models.paper.patches import (
+    PATCH_CELLS,
+    STEP_CELLS,
+    STEP_PX,
+    any_in_patch,
+    crop,
+    padded_size,
+    split,
+)
 from viewmend.types import ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
@@ -138,7 +146,9 @@ class Encoder(nn.Module):
 
 
 def _interleave(
-    early: Float[Tensor, "view early height width"], late: Float[Tensor, "view late height width"], groups: int
+    early: Float[Tensor, "view early height width"],
+    late: Float[Tensor, "view late height width"],
+    groups: int,
 ) -> Float[Tensor, "view early+late height width"]:
     """Both tensors' channels, group by group, early first."""
     # With channels last in memory, one concatenation is enough; it is three times as fast as one per group.

@@ -33,7 +33,11 @@ CHUNK_ENTRIES = 1 << 22
 def rope_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
     """Radians per unit of (u, v, s) for each pair of channels: geometric along its axis, 0 for the other axes."""
     pairs = head_dim // 2
-    per_axis = 3 * pairs // 8, 3 * pairs // 8, pairs - 2 * (3 * pairs // 8)  # three eighths each of u and v, a quarter
+    per_axis = (
+        3 * pairs // 8,
+        3 * pairs // 8,
+        pairs - 2 * (3 * pairs // 8),
+    )  # three eighths each of u and v, a quarter
     octaves = (torch.linspace(0, 1, count, dtype=torch.float64) for count in per_axis)
     return torch.block_diag(*(2 * math.pi / LONGEST * (LONGEST / SHORTEST) ** x for x in octaves)).float()
 
@@ -67,7 +71,12 @@ def attend(Q: Queries, K: Keys, V: Keys, keep: Bool[Tensor, "sample key"] | None
 
 
 def attend_and_sum(
-    Q: Queries, K: Keys, V: Keys, keep: Bool[Tensor, "sample key"], counted: Bool[Tensor, "sample query"], scale: float
+    Q: Queries,
+    K: Keys,
+    V: Keys,
+    keep: Bool[Tensor, "sample key"],
+    counted: Bool[Tensor, "sample query"],
+    scale: float,
 ) -> tuple[Queries, PerKey]:
     """`attend`, and the attention that each key received, summed over heads and the counted queries.
 
@@ -165,7 +174,12 @@ class Transformer(nn.Module):
         return rearrange(self.keys_values(tokens), "n (b two d) -> b two n d", two=2, d=self.config.dim)
 
     def forward(
-        self, tokens: Tokens, at: TokenPositions, keys_values: KeysValues, context_at: TokenPositions, top_k: int | None
+        self,
+        tokens: Tokens,
+        at: TokenPositions,
+        keys_values: KeysValues,
+        context_at: TokenPositions,
+        top_k: int | None,
     ) -> Tokens:
         """The input tokens P after all blocks; each group prunes its context to `top_k` tokens, None for no pruning."""
         rotations = [None, None]
@@ -177,7 +191,12 @@ class Transformer(nn.Module):
         return tokens
 
     def run_group(
-        self, group: int, tokens: Tokens, counted: Bool[Tensor, "sample query"], context: Context, top_k: int | None
+        self,
+        group: int,
+        tokens: Tokens,
+        counted: Bool[Tensor, "sample query"],
+        context: Context,
+        top_k: int | None,
     ) -> Tokens:
         """The input tokens after one group. Attention of the counted tokens decides what its first block prunes."""
         kept: Tensor | None = None

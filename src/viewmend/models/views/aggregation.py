@@ -44,7 +44,9 @@ class SampleAggregator(nn.Module):
             nn.Linear(2 * width, channels + 1),
         )
 
-    def forward(self, samples: RaySamples, prior: Float[Tensor, "ray sample view"] | None = None) -> AggregatedSamples:
+    def forward(
+        self, samples: RaySamples, prior: Float[Tensor, "ray sample view"] | None = None
+    ) -> AggregatedSamples:
         """The aggregated samples; `prior` replaces the initial weights of the cameras."""
         features = samples.features
         statistics = samples.statistics
@@ -69,7 +71,9 @@ class SampleAggregator(nn.Module):
         out = self.sample(torch.cat([summary.float(), mean, variance, statistics, certainty], -1))
         return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
 
-    def _aggregate_numba(self, samples: RaySamples, prior: Float[Tensor, "ray sample view"]) -> AggregatedSamples:
+    def _aggregate_numba(
+        self, samples: RaySamples, prior: Float[Tensor, "ray sample view"]
+    ) -> AggregatedSamples:
         """The same in float32 by a compiled loop: sums over a few cameras are slow in PyTorch."""
         from viewmend.models.views._sampler_numba import aggregate
 

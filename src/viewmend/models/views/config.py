@@ -47,7 +47,9 @@ class Sizes:
         names = [field.name for field in fields(cls)]
         unknown = sorted(set(values) - set(names))
         if unknown:
-            raise ValueError(f"expected keys among {names}, got {unknown}; use the version of viewmend that wrote them")
+            raise ValueError(
+                f"expected keys among {names}, got {unknown}; use the version of viewmend that wrote them"
+            )
         return typed(values, cls)
 
 

@@ -74,7 +74,9 @@ class ErrorPredictor(Network):
         self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + STATISTICS + BEHIND_CHANNELS, features)
         self.head = nn.Conv2d(features, CELL_PX**2 * len(ErrorMap._fields), 1)
 
-    def forward(self, view: IncompleteView, sources: SourceCameras, scale: SceneScale | None = None) -> ErrorMap:
+    def forward(
+        self, view: IncompleteView, sources: SourceCameras, scale: SceneScale | None = None
+    ) -> ErrorMap:
         """Predicted errors of a view's pixels; its E is not used. For a crop, `scale` is that of the whole view."""
         if scale is None:
             scale = SceneScale.of(view)

@@ -145,7 +145,9 @@ def concatenate_channels(
     return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
 
 
-def crop_to(image: Float[Tensor, "channel rows columns"], shape: torch.Size) -> Float[Tensor, "channel height width"]:
+def crop_to(
+    image: Float[Tensor, "channel rows columns"], shape: torch.Size
+) -> Float[Tensor, "channel height width"]:
     """The first rows and columns of an image.
 
     `torch.export` would assume that a slice cuts off none, or some; so they are gathered while it traces.
@@ -180,7 +182,9 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
         self.join = nn.ModuleList(nn.Conv2d(fine, fine, 3, padding=1) for fine in widths[:-1])
 
-    def forward(self, image: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 feature height width"]:
+    def forward(
+        self, image: Float[Tensor, "1 channel height width"]
+    ) -> Float[Tensor, "1 feature height width"]:
         """Features of the same resolution."""
         return self._scales(F.relu(self.enter(image.contiguous(memory_format=torch.channels_last))))
 

@@ -228,7 +228,9 @@ class ViewSynthNet(Network):
         scale = SceneScale.of(view)
         view = replace(view, depth=rim_depth(view.depth))
         predicted = view.depth > 0
-        distribution = self._depth_distribution(view, sources, scale, predicted, ViewImage.of(view, guess, predicted))
+        distribution = self._depth_distribution(
+            view, sources, scale, predicted, ViewImage.of(view, guess, predicted)
+        )
         pixels = torch.nonzero(predicted)
         surface = surface_points(view.depth, scale, pixels, distribution)
         found = torch.stack([surface.depth, surface.probability], 1)
@@ -244,7 +246,9 @@ class ViewSynthNet(Network):
 
     @torch.no_grad()
     @light_operations()
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: State
+    ) -> tuple[CompletedView, State]:
         """Predicts all of E on the proxy and its rim, or attenuates it where `view.fade` says so.
 
         With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their surroundings.
@@ -303,7 +307,9 @@ class ViewSynthNet(Network):
             with heavy_operations():
                 features = self.unet.forward_points(inputs, cells, concatenate_channels(images.to(inputs)))
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
-        return DepthDistribution(cells, index_image(cells, depth.shape), depth, logits, samples, cameras, features)
+        return DepthDistribution(
+            cells, index_image(cells, depth.shape), depth, logits, samples, cameras, features
+        )
 
     def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
         """The aggregated samples of the rays of cells, chunk by chunk."""

@@ -63,7 +63,9 @@ class DepthDistribution(NamedTuple):
     features: Float[Tensor, "1 feature rows columns"]
     """Output of the U-Net."""
 
-    def interpolate(self, values: Float[Tensor, "cell channel"], pixels: Pixels) -> Float[Tensor, "pixel channel"]:
+    def interpolate(
+        self, values: Float[Tensor, "cell channel"], pixels: Pixels
+    ) -> Float[Tensor, "pixel channel"]:
         """The cells' values at pixels (row, column), bilinearly between existing cells."""
         weighted = F.pad(values, (0, 1), value=1.0)
         padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
@@ -198,6 +200,8 @@ def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
     return torch.from_numpy(removed[labels]).to(predicted.device)
 
 
-def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
+def unpremultiply(
+    colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]
+) -> Float[Tensor, "pixel 3"]:
     """Colours on black, divided by their mask."""
     return (colour / mask.clamp_min(MIN_MASK)).clamp(0, 1)

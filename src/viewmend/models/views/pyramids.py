@@ -217,7 +217,9 @@ class SourceCameras:
 
     def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
         """Which source cameras have one of these names."""
-        return torch.tensor([name in names for name in self.cameras.names], device=self.silhouettes.mask.device)
+        return torch.tensor(
+            [name in names for name in self.cameras.names], device=self.silhouettes.mask.device
+        )
 
     def levels(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[list[list[int]]]:
         """Fine and wide level of each source camera, and of each silhouette; see `choose_levels`."""

@@ -404,7 +404,9 @@ def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ra
     return (at.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
 
 
-def project_lines(rays: Rays, cameras: Cameras) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
+def project_lines(
+    rays: Rays, cameras: Cameras
+) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
     """Homogeneous image coordinates of rays in every camera: what they gain per metre of z-depth, and their start."""
     P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
     linear = P[:, :, :3]
@@ -440,7 +442,9 @@ def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample v
     return along / lengths.clamp_min(1e-12)
 
 
-def sample_level(levels: MipLevels, at: Projections, channels: int) -> Float[Tensor, "ray sample view channel"]:
+def sample_level(
+    levels: MipLevels, at: Projections, channels: int
+) -> Float[Tensor, "ray sample view channel"]:
     """The first channels of each camera's image, bilinearly, 255 as 1; meaningless where a sample is not in view."""
     x = at.u_px * levels.scale + 0.5
     y = at.v_px * levels.scale + 0.5
@@ -455,7 +459,9 @@ def sample_level(levels: MipLevels, at: Projections, channels: int) -> Float[Ten
     return ((1 - below) * upper + below * lower) / 255
 
 
-def sample_level_cubic(levels: MipLevels, at: Projections, channels: int) -> Float[Tensor, "ray sample view channel"]:
+def sample_level_cubic(
+    levels: MipLevels, at: Projections, channels: int
+) -> Float[Tensor, "ray sample view channel"]:
     """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
     x = at.u_px * levels.scale + 0.5
     y = at.v_px * levels.scale + 0.5
@@ -487,7 +493,9 @@ def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
     return (size * subject_px.double()).round().clamp_min(1).long()
 
 
-def _box_sides(mask_sums: Int[Tensor, "view"], outline_sums: Int[Tensor, "camera"]) -> tuple[Tensor, Tensor, Tensor]:
+def _box_sides(
+    mask_sums: Int[Tensor, "view"], outline_sums: Int[Tensor, "camera"]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Sides, in pixels, of boxes of masks, of every second pixel of colours, and of silhouettes."""
     source_px = (mask_sums / 255).mean().sqrt()
     rig_px = (outline_sums / 255).mean().sqrt()

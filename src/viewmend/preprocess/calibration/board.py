@@ -79,7 +79,9 @@ def _crossing(
     high = np.minimum(np.floor(start_px + reach) + 1, [grey.shape[1], grey.shape[0]]).astype(int)
     if (high - low < 3).any():
         return start_px
-    pixels = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+    pixels = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), -1).reshape(
+        -1, 2
+    )
     away_m = _mapped(board_from_image, pixels.astype(np.float64)) - start_m
     clear = np.maximum(clear_m - CLEAR_PX * per_px, LEAST_CLEAR * clear_m)
     used = (np.abs(away_m) < clear).any(1) & (np.abs(away_m) < ALONG * square_m).all(1)
@@ -195,7 +197,9 @@ def parse_board(text: str, dictionary: str) -> Board:
         expected = "at least 4 x 4 squares, and markers smaller than squares"
         raise ValueError(f"expected {expected}, got '{text}'; measure again")
     if not re.fullmatch(r"DICT_\w+", dictionary) or not hasattr(cv2.aruco, dictionary):
-        raise ValueError(f"expected a dictionary of OpenCV, got '{dictionary}'; choose one such as DICT_5X5_1000")
+        raise ValueError(
+            f"expected a dictionary of OpenCV, got '{dictionary}'; choose one such as DICT_5X5_1000"
+        )
     return Board(columns, rows, square_m, marker_m, dictionary)
 
 
@@ -209,7 +213,9 @@ def open_footage(folder: Path) -> NativeCalibration:
     if len(chosen) < 2:
         expected = "two or more videos, or folders of images"
         got = len(chosen)
-        raise CaptureError(f"{folder}: expected {expected}, got {got}; put one for each camera there, named after it")
+        raise CaptureError(
+            f"{folder}: expected {expected}, got {got}; put one for each camera there, named after it"
+        )
     try:
         footage = collect_footage(folder, chosen)
     except ValueError as error:
@@ -236,7 +242,11 @@ def look_for(
     for view, camera in enumerate(track(footage.cameras)):
         reader = CameraReader(footage.folder, camera, footage.frames, clock)
         for time in times:
-            images = reader.read(time) if reader.has(time, lambda path: (footage.folder / path).is_file()) else None
+            images = (
+                reader.read(time)
+                if reader.has(time, lambda path: (footage.folder / path).is_file())
+                else None
+            )
             corners = None if images is None else board.find(cv2.cvtColor(images.rgb, cv2.COLOR_RGB2GRAY))
             if corners is not None:
                 seen[view, time] = corners

@@ -63,7 +63,9 @@ class CalibratedCamera:
         return float(np.sqrt((self.off**2).sum(1).mean()))
 
 
-def calibrate(seen: Seen, board: Board, names: Sequence[str], sizes: Sequence[Size]) -> list[CalibratedCamera]:
+def calibrate(
+    seen: Seen, board: Board, names: Sequence[str], sizes: Sequence[Size]
+) -> list[CalibratedCamera]:
     """The cameras of these names and image sizes (width, height) from what they saw of the board.
 
     ValueError if a camera saw the board too seldom, or never together with the others.
@@ -109,7 +111,9 @@ def _alone(seen: Seen, board: Board, view: int, name: str, size: Size) -> tuple[
 
 def _board_pose(corners: Corners, board: Board, K: Matrix, dist: Distortion) -> Pose:
     """camera_from_board by one image."""
-    _, turn, shift = cv2.solvePnP(board.corners_m[corners.ids], corners.pixels, K, dist, flags=cv2.SOLVEPNP_IPPE)
+    _, turn, shift = cv2.solvePnP(
+        board.corners_m[corners.ids], corners.pixels, K, dist, flags=cv2.SOLVEPNP_IPPE
+    )
     return _matrix(np.concatenate([turn.ravel(), shift.ravel()]))
 
 
@@ -172,7 +176,9 @@ class _Rows:
     def sparsity(self) -> object:
         """Which residual depends on which parameter; the first camera stays where it is."""
         corners = len(self.view)
-        sparsity = lil_matrix((2 * (corners + self.views), CAMERA * self.views + POSE * self.times), dtype=int)
+        sparsity = lil_matrix(
+            (2 * (corners + self.views), CAMERA * self.views + POSE * self.times), dtype=int
+        )
         rows = np.arange(corners)
         for axis in range(2):
             for n in range(CAMERA):
@@ -233,7 +239,9 @@ def _draw(camera: NativeCamera, found: CalibratedCamera) -> Picture:
     scale = TILE_PX / camera.width
     image = np.full((max(1, round(camera.height * scale)), TILE_PX, 3), 32, np.uint8)
     for corner, off in zip(found.corners * scale, found.off * scale * ENLARGED, strict=True):
-        start, end = (np.clip(p, -2 * TILE_PX, 3 * TILE_PX).astype(int).tolist() for p in (corner, corner + off))
+        start, end = (
+            np.clip(p, -2 * TILE_PX, 3 * TILE_PX).astype(int).tolist() for p in (corner, corner + off)
+        )
         cv2.line(image, start, end, (255, 200, 60), 1, cv2.LINE_AA)
         cv2.circle(image, start, 1, (255, 255, 255), -1)
     return image

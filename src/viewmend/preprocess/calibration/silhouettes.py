@@ -44,7 +44,9 @@ def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "po
     return replace(rig, camera_from_world=rigid(turned, moved).to(rig.camera_from_world))
 
 
-def _similarity(source: Places, target: Places) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
+def _similarity(
+    source: Places, target: Places
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
     """R, t and s for which s R x + t is nearest to the targets."""
     a = source - source.mean(0)
     b = target - target.mean(0)
@@ -89,7 +91,9 @@ class Refinement:
     """The same, refined."""
 
 
-def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float) -> Refinement:
+def refine_by_silhouettes(
+    frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float
+) -> Refinement:
     """Refine poses and focal lengths of `LEAST_CAMERAS` or more; several frames constrain them better than one.
 
     The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one for each frame;
@@ -194,7 +198,9 @@ class _Problem:
         looks = zip(self.sights, depths, strict=True)
         return [float(sight.sample(rig, depth[:, None]).residuals.sum()) for sight, depth in looks]
 
-    def normal_equations(self, x: Moves, depths: Depths) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"]]:
+    def normal_equations(
+        self, x: Moves, depths: Depths
+    ) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"]]:
         """Gauss and Newton's, without the places' own depths, which follow."""
         rig = self.rig(x)
         H = self.hold * np.eye(x.size)
@@ -260,7 +266,9 @@ class HeldOutIou:
     """With the others refined by their masks alone; the camera itself is as it was."""
 
 
-def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float) -> HeldOutIou:
+def refined_without(
+    frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float
+) -> HeldOutIou:
     """Refine all cameras but one, and look at the hull through that one."""
     others = [frame.without([name]) for frame in frames]
     held = [frame.select([name]) for frame in frames]
@@ -287,7 +295,9 @@ def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
         times = range(min(LEFT_OUT_TIMES, len(frames)))
         return min(HOLDS, key=lambda hold: sum(missed_px(frames, time, bounds, hold) for time in times))
     names = left_out(frames[0].cameras.names)
-    return max(HOLDS, key=lambda hold: sum(refined_without(frames, name, bounds, hold).after for name in names))
+    return max(
+        HOLDS, key=lambda hold: sum(refined_without(frames, name, bounds, hold).after for name in names)
+    )
 
 
 def left_out(names: Sequence[str]) -> list[str]:

@@ -37,7 +37,9 @@ def demand_size(rgb: Rgb, expected: np.ndarray, what: str) -> None:
     if rgb.shape[:2] != expected.shape[:2]:
         h, w = rgb.shape[:2]
         height, width = expected.shape[:2]
-        raise ValueError(f"expected an image of {width} x {height} pixels as {what} has, got {w} x {h}; resize it")
+        raise ValueError(
+            f"expected an image of {width} x {height} pixels as {what} has, got {w} x {h}; resize it"
+        )
 
 
 def soft_mask(distance: Values, sure: float, possible: float) -> Mask:

@@ -59,21 +59,31 @@ class NetworkMasks:
         if self._plate_name is not None:
             return width, height
         scale = min(1.0, MODNET_PX / min(width, height))
-        wide, high = (max(MODNET_STEP, round(side * scale / MODNET_STEP) * MODNET_STEP) for side in (width, height))
+        wide, high = (
+            max(MODNET_STEP, round(side * scale / MODNET_STEP) * MODNET_STEP) for side in (width, height)
+        )
         return wide, high
 
-    def _matte(self, given: dict[str, Float32[np.ndarray, "1 3 height width"]]) -> Float32[np.ndarray, "height width"]:
+    def _matte(
+        self, given: dict[str, Float32[np.ndarray, "1 3 height width"]]
+    ) -> Float32[np.ndarray, "height width"]:
         names = [output.name for output in self._session.get_outputs()]
         try:
             found = dict(zip(names, self._session.run(None, given), strict=True))
         except Exception as error:  # onnxruntime's own classes, one a cause
-            raise ValueError(f"{self._file}: expected a network that takes images, got: {str(error)[:200]}") from None
-        order = sorted(names, key=lambda n: ALPHA_OUTPUTS.index(n.lower()) if n.lower() in ALPHA_OUTPUTS else 9)
+            raise ValueError(
+                f"{self._file}: expected a network that takes images, got: {str(error)[:200]}"
+            ) from None
+        order = sorted(
+            names, key=lambda n: ALPHA_OUTPUTS.index(n.lower()) if n.lower() in ALPHA_OUTPUTS else 9
+        )
         for name in order:
             value = np.asarray(found[name])
             if value.ndim == 4 and value.shape[:2] == (1, 1) and np.isfinite(value).all():
                 return value[0, 0].astype(np.float32)
-        raise ValueError(f"{self._file}: expected an output (1, 1, height, width), the matte, got none; export it so")
+        raise ValueError(
+            f"{self._file}: expected an output (1, 1, height, width), the matte, got none; export it so"
+        )
 
 
 def _session(file: Path):

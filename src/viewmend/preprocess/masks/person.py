@@ -145,7 +145,9 @@ def _detect_in(rgb: Rgb, left: int, top: int, side: int) -> list[Roi]:
     boxes, logits = _run("detector", np.asarray(small, np.float32) / 127.5 - 1)
     scores = 1 / (1 + np.exp(-np.clip(logits[0, :, 0], -80, 80)))
     # A box is its centre, its size and four points; all but the size are relative to the anchor.
-    points = boxes[0].reshape(-1, 6, 2) + np.where(np.arange(6)[:, None] == 1, 0, _anchors()[:, None] * DETECTOR_PX)
+    points = boxes[0].reshape(-1, 6, 2) + np.where(
+        np.arange(6)[:, None] == 1, 0, _anchors()[:, None] * DETECTOR_PX
+    )
     kept: list[int] = []
     for n in np.argsort(-scores):
         if scores[n] < MIN_SCORE:
@@ -180,7 +182,9 @@ def _segment(rgb: Rgb, roi: Roi) -> tuple[Float32[np.ndarray, "height width"], R
     height, width = rgb.shape[:2]
     image_from_roi = roi.image_from_roi()
     shrink = cv2.INTER_AREA if roi.side > SEGMENTER_PX else cv2.INTER_LINEAR
-    crop = cv2.warpAffine(rgb, image_from_roi, (SEGMENTER_PX, SEGMENTER_PX), flags=shrink | cv2.WARP_INVERSE_MAP)
+    crop = cv2.warpAffine(
+        rgb, image_from_roi, (SEGMENTER_PX, SEGMENTER_PX), flags=shrink | cv2.WARP_INVERSE_MAP
+    )
     landmarks, presence, logits, *_ = _run("segmenter", np.asarray(crop, np.float32) / 255)
     if float(presence[0, 0]) < MIN_SCORE:
         return None

@@ -103,13 +103,17 @@ def plates_from_files(capture: CaptureFolder, place: str) -> dict[str, Rgb]:
     plates = {}
     for name, path in zip(capture.cameras.names, _paths(capture.cameras.names, place), strict=True):
         if not path.is_file():
-            raise CaptureError(f"{path}: expected the clean plate of camera '{name}', got no file; check --plate")
+            raise CaptureError(
+                f"{path}: expected the clean plate of camera '{name}', got no file; check --plate"
+            )
         where = f"{path}: plate of camera '{name}'"
         plate = read_plate(path, where)
         width, height = capture.cameras.select([name]).max_size_px
         if plate.shape[:2] != (height, width):
             got = f"{plate.shape[1]} x {plate.shape[0]}"
-            raise CaptureError(f"{where}: expected {width} x {height} pixels as the images have, got {got}; resize it")
+            raise CaptureError(
+                f"{where}: expected {width} x {height} pixels as the images have, got {got}; resize it"
+            )
         plates[name] = capture.undistort(name, plate)
     return plates
 
@@ -132,7 +136,9 @@ def plates_from_frames(source: CaptureSource, times: range) -> dict[str, Rgb]:
             images[name].append(view_rgb(frame, view))
     absent = [name for name, seen in images.items() if not seen]
     if absent:
-        raise CaptureError(f"{source.name}: expected images of camera '{absent[0]}' for its plate, got none there")
+        raise CaptureError(
+            f"{source.name}: expected images of camera '{absent[0]}' for its plate, got none there"
+        )
     return {name: median_plate(seen) for name, seen in images.items()}
 
 
@@ -145,7 +151,9 @@ def _paths(names: Sequence[str], place: str) -> list[Path]:
     if CAMERA in place:
         return [Path(place.replace(CAMERA, name)) for name in names]
     folder = Path(place)
-    found = {path.stem: path for path in sorted(folder.iterdir()) if path.is_file()} if folder.is_dir() else {}
+    found = (
+        {path.stem: path for path in sorted(folder.iterdir()) if path.is_file()} if folder.is_dir() else {}
+    )
     if (chosen := match_names(names, found)) is None:
         raise CaptureError(
             f"{place}: expected a folder with one image or video named after each camera ({', '.join(names)[:80]}), "

@@ -213,7 +213,9 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
     y, a_m, a_f, d_m, d_f, back, z = TORSO.T
     belly = np.exp(-(((y - 0.605) / 0.065) ** 2)) * np.where(w > 0, 1.0, 0.35)
     trunk = np.clip((0.85 - y) / 0.05, 0, 1)
-    width = (a_m + f * (a_f - a_m)) * (1 + trunk * (0.05 * w + 0.02 * (person.muscle - 0.5))) + 0.008 * w * belly
+    width = (a_m + f * (a_f - a_m)) * (
+        1 + trunk * (0.05 * w + 0.02 * (person.muscle - 0.5))
+    ) + 0.008 * w * belly
     front = (d_m + f * (d_f - d_m)) * (1 + 0.04 * w * trunk) + 0.026 * w * belly
     rear = back * (1 + 0.05 * w * trunk) + 0.008 * w * belly
     columns = np.stack([width, front, rear, z], 1) * H
@@ -227,7 +229,9 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
 
     def pair(first: str, last: str, profile: Float[np.ndarray, "knot 3"], girth: float) -> tuple[Limb, ...]:
         t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth * H, H]))
-        return tuple(Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES)
+        return tuple(
+            Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES
+        )
 
     arms = pair("upperarm", "hand", ARM_PROFILE, girth)
     legs = pair("thigh", "foot", LEG_PROFILE, leg_girth)
@@ -290,7 +294,11 @@ def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
 
 
 def _tube(
-    tip: Vector, centers: Float[np.ndarray, "row 3"], across: Vector, radii: Float[np.ndarray, "2 row"], columns: int
+    tip: Vector,
+    centers: Float[np.ndarray, "row 3"],
+    across: Vector,
+    radii: Float[np.ndarray, "2 row"],
+    columns: int,
 ) -> Float[np.ndarray, "row+1 column 3"]:
     """Ellipses around a line from its far end to its near one (up), after their tip; `across`: the first radius."""
     up = unit(np.gradient(centers, axis=0))
@@ -358,7 +366,9 @@ def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Pa
     cosine = np.cos(phi)
     sine = np.sin(phi)
     x = half[:, None] * np.sign(cosine) * np.abs(cosine) ** np.where(sine > 0, 0.85, 0.35)
-    y = np.where(sine > 0, sole + (tall - sole)[:, None] * np.abs(sine) ** 0.9, sole * (1 - np.abs(sine) ** 0.35))
+    y = np.where(
+        sine > 0, sole + (tall - sole)[:, None] * np.abs(sine) ** 0.9, sole * (1 - np.abs(sine) ** 0.35)
+    )
     # Heel and tip close to a point just above the floor.
     middle = 0.006 * H
     close = np.clip(half / (0.012 * H), 0, 1)[:, None]

@@ -7,7 +7,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.studio.procedural.body import Body, Torso, body_weights, hand_patches, mix, one_joint, smoothstep
+from viewmend.studio.procedural.body import (
+    Body,
+    Torso,
+    body_weights,
+    hand_patches,
+    mix,
+    one_joint,
+    smoothstep,
+)
 from viewmend.studio.procedural.fabric import (
     PX_PER_M,
     QUIET,
@@ -51,13 +59,17 @@ class Folds:
         share = np.clip((np.linspace(0, 1, field.shape[1]) - 0.85) / 0.15, 0, 1)
         return self.depth_m * (field + share * (field[:, :1] - field))
 
-    def crease(self, canvas: Canvas, uv: Float[np.ndarray, "row column 2"]) -> Float[np.ndarray, "row column"]:
+    def crease(
+        self, canvas: Canvas, uv: Float[np.ndarray, "row column 2"]
+    ) -> Float[np.ndarray, "row column"]:
         """Displacement at places of the canvas, metres."""
         height = self.height(canvas).astype(np.float32)
         rows, columns = height.shape
         x = uv[..., 0] * (columns - 1)
         y = (1 - uv[..., 1]) * (rows - 1)
-        return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(np.float64)
+        return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(
+            np.float64
+        )
 
     def paint(self, canvas: Canvas, painter: Painter) -> Image:
         """The cloth in its creases: slopes that face down are darker."""
@@ -105,14 +117,18 @@ def torso_sheet(
     ring = torso.point(around, np.full_like(around, middle))
     girth = float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum())
     canvas = Canvas(girth, top - bottom, folds.px_per_m)
-    uv = np.stack([np.broadcast_to(np.linspace(0, 1, len(around)), s.shape), (s - bottom) / (top - bottom)], -1)
+    uv = np.stack(
+        [np.broadcast_to(np.linspace(0, 1, len(around)), s.shape), (s - bottom) / (top - bottom)], -1
+    )
     outward = outward_of(theta)
     points = shape.settle(torso.point(theta, y), outward, 0)
     points = points + folds.crease(canvas, uv)[..., None] * outward
     lips = []
     for row, rise in ((0, 0.004), (-1, -0.012)):
         inner = body.torso.point(around, y[row])
-        axis = inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y[row], torso.y, torso.z)[:, None]
+        axis = (
+            inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y[row], torso.y, torso.z)[:, None]
+        )
         lips.append(axis + 0.93 * (inner - axis) + np.array([0, rise, 0]))
     points = np.concatenate([lips[0][None], points, lips[1][None]])
     uv = np.concatenate([uv[:1], uv, uv[-1:]])
@@ -237,7 +253,11 @@ class Outfit:
 
 def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
     """Draw an outfit."""
-    odds = [0.26, 0.22, 0.12, 0.08, 0.12, 0.11, 0.09] if femininity > 0.5 else [0.32, 0.34, 0.1, 0.02, 0.22, 0, 0]
+    odds = (
+        [0.26, 0.22, 0.12, 0.08, 0.12, 0.11, 0.09]
+        if femininity > 0.5
+        else [0.32, 0.34, 0.1, 0.02, 0.22, 0, 0]
+    )
     bottom = BOTTOMS[int(rng.choice(len(BOTTOMS), p=np.array(odds) / sum(odds)))]
     top = TOPS[int(rng.choice(len(TOPS), p=[0.32, 0.2, 0.2, 0.2, 0.08]))]
     outer = OUTERS[int(rng.choice(3, p=[0.72, 0.16, 0.12]))]
@@ -298,7 +318,9 @@ def sample_cut(outfit: Outfit) -> Cut:
     )
 
 
-def neckline(around: Azimuths, height_m: float, depth: float, vee: bool = False, wide: float = 0.0) -> Azimuths:
+def neckline(
+    around: Azimuths, height_m: float, depth: float, vee: bool = False, wide: float = 0.0
+) -> Azimuths:
     """Heights of a neckline in metres: `depth` (share of the height) lower in front, round or V-shaped."""
     turn = np.abs(np.angle(np.exp(1j * around)))
     dip = np.clip(1 - turn / 0.75, 0, 1) if vee else np.exp(-((turn / 0.85) ** 2))
@@ -342,7 +364,9 @@ class Tailor:
         around = azimuths(65)
         high = neckline(around, H, cut.neck, cut.vee, 0.008 if outfit.top == "tank top" else 0.0)
         low = np.full_like(around, cut.top_hem * H)
-        trunk = torso_sheet(self.body, shape, low, high, around, self._paint_top, self.folds(0.0022, 0.10, 0.16, 0), 40)
+        trunk = torso_sheet(
+            self.body, shape, low, high, around, self._paint_top, self.folds(0.0022, 0.10, 0.16, 0), 40
+        )
         start = -0.03 if outfit.outer == "none" else 0.8
         if outfit.outer != "none":
             # Only what an open front and the hems show: the rest could but poke through.
@@ -437,7 +461,9 @@ class Tailor:
         ease = float(rng.uniform(0.026, 0.034))
         torso = body.torso.eased(ease, float(rng.uniform(0.5, 0.9)))
         torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
-        shape = replace(body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms))
+        shape = replace(
+            body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms)
+        )
         around = azimuths(65, float(rng.uniform(0.12, 0.4)))
         coat = outfit.outer == "coat"
         cloth = outfit.fabrics[2].paint

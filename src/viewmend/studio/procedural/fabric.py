@@ -14,7 +14,21 @@ from viewmend.studio.performer import BoundMesh, TexturedMesh
 from viewmend.studio.procedural.skeleton import Vector
 
 PX_PER_M = 520.0
-WORDS = ("VIEW", "MEND", "STUDIO", "NORTH", "RIVER", "SUN", "TEAM 7", "HELLO", "WAVE", "1984", "JAZZ", "ATLAS", "GO!")
+WORDS = (
+    "VIEW",
+    "MEND",
+    "STUDIO",
+    "NORTH",
+    "RIVER",
+    "SUN",
+    "TEAM 7",
+    "HELLO",
+    "WAVE",
+    "1984",
+    "JAZZ",
+    "ATLAS",
+    "GO!",
+)
 KINDS = (
     *("plain", "heather", "stripes", "pinstripes", "bands", "gingham", "tartan", "dots"),
     *("flowers", "blobs", "gradient", "zigzag", "denim", "knit", "letters"),
@@ -213,7 +227,9 @@ def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
     return flat / 255.0
 
 
-def write(image: Image, canvas: Canvas, word: str, color: Vector, at_m: tuple[float, float], width_m: float) -> Image:
+def write(
+    image: Image, canvas: Canvas, word: str, color: Vector, at_m: tuple[float, float], width_m: float
+) -> Image:
     """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
     font = cv2.FONT_HERSHEY_DUPLEX
     thick = max(2, round(0.05 * width_m * canvas.px_per_m))
@@ -300,7 +316,9 @@ def _shown_faces(patch: Patch) -> Int[np.ndarray, "face 3"]:
     """Two triangles for each kept cell of a grid, counter-clockwise from outside; none that are a line or a point."""
     rows, columns = patch.points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    a, b, c, d = (
+        part.reshape(-1) for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1])
+    )
     triangles = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     if patch.keep is not None:
         triangles = triangles[patch.keep.reshape(-1)[triangles].any(1)]

@@ -71,7 +71,9 @@ def build_head(person: Physique, skeleton: Skeleton) -> Head:
     return Head(person, np.array([0.0, person.height_m - size, neck[2] + 0.012]), size)
 
 
-def face_grid(rows: int, columns: int) -> tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"]]:
+def face_grid(
+    rows: int, columns: int
+) -> tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"]]:
     """Azimuths and heights of a grid over the head, denser on the face."""
     c = np.linspace(-1, 1, columns)
     azimuth = np.pi * (0.55 * c + 0.45 * c**3)
@@ -124,14 +126,22 @@ def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_
 
     image = blend(image, skin * [1.0, 0.72, 0.68], 0.35 * soft(0.62, 0.36, 0.28, 0.09))
     image = blend(image, skin * 0.72, 0.5 * soft(EYE_AZIMUTH, EYE_Y + 0.01, 0.20, 0.05))
-    image = blend(image, skin * 0.6, 0.35 * np.maximum(soft(0.16, 0.42, 0.05, 0.1), soft(0.0, 0.315, 0.16, 0.012)))
+    image = blend(
+        image, skin * 0.6, 0.35 * np.maximum(soft(0.16, 0.42, 0.05, 0.1), soft(0.0, 0.315, 0.16, 0.012))
+    )
     image = blend(image, skin * 0.35, 0.8 * soft(0.08, 0.327, 0.035, 0.008))
     stubble = rng.random() * (f < 0.4) * (rng.random() < 0.6)
     jaw = smoothstep(-y, -0.30, -0.17) * smoothstep(-turn, -1.6, -1.25)
     image = blend(image, 0.5 * hair_rgb + 0.3 * skin, 0.7 * stubble * jaw)
-    lip = skin * [0.85, 0.55, 0.55] if f < 0.5 else 0.5 * skin + 0.5 * hsv(rng.uniform(-0.05, 0.02), 0.65, 0.6)
+    lip = (
+        skin * [0.85, 0.55, 0.55] if f < 0.5 else 0.5 * skin + 0.5 * hsv(rng.uniform(-0.05, 0.02), 0.65, 0.6)
+    )
     wide = 0.27 + 0.03 * face[4]
-    lips = 1 - (turn / wide) ** 2 - ((y - 0.200) / (0.034 * np.sqrt(np.clip(1 - (turn / wide) ** 2, 0.02, 1)))) ** 2
+    lips = (
+        1
+        - (turn / wide) ** 2
+        - ((y - 0.200) / (0.034 * np.sqrt(np.clip(1 - (turn / wide) ** 2, 0.02, 1)))) ** 2
+    )
     image = blend(image, lip, 0.85 * crisp(lips, 0.5))
     image = blend(image, lip * 0.4, crisp(1 - (turn / (wide * 0.97)) ** 2 - ((y - 0.201) / 0.0055) ** 2, 0.8))
     x = turn - EYE_AZIMUTH - 0.01 * face[5]
@@ -206,7 +216,9 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[P
         inside = inside * smoothstep(np.abs(azimuth), 1.3, 1.6) * smoothstep(-y, -0.74, -0.60)
     bumps = Canvas(0.6, 0.26, 100.0).noise(rng, 0.03, 0.03 if hair.style == "afro" else 0.06)
     rows, columns = bumps.shape
-    curl = bumps[((1 - y) * (rows - 1)).astype(int), ((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(int)]
+    curl = bumps[
+        ((1 - y) * (rows - 1)).astype(int), ((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(int)
+    ]
     curl = curl * np.clip((np.pi - np.abs(azimuth)) / 0.4, 0, 1) * (0.0 if hair.style == "cap" else 0.22)
     part = 0.3 * np.exp(-(((azimuth - 0.5) / 0.25) ** 2)) * (hair.style == "parted")
     layer = thick * inside * (1 + curl - part) - 0.006 * (1 - inside)
@@ -257,7 +269,12 @@ def _tied(head: Head, hair: Hair, chart: Image) -> Patch:
         return Patch(points, uv, one_joint(v.shape, "head"), chart)
     s = 1 - v
     length = head.size_m * (0.9 + 1.0 * hair.volume)
-    radius = 0.10 * head.size_m * np.sqrt(np.clip(s * 6, 0, 1)) * np.interp(s, [0, 0.1, 0.5, 1], [0.55, 0.9, 1, 0.05])
+    radius = (
+        0.10
+        * head.size_m
+        * np.sqrt(np.clip(s * 6, 0, 1))
+        * np.interp(s, [0, 0.1, 0.5, 1], [0.55, 0.9, 1, 0.05])
+    )
     drop = -length * s + 0.03 * np.sin(np.pi * s)
     back = -0.09 * np.sin(np.minimum(s * 3, 1.57))
     ring = np.stack([radius * np.sin(phi), np.zeros_like(s), radius * np.cos(phi)], -1)

@@ -107,7 +107,10 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     turn = 2 * np.pi * beats
     bob = (0.045 if run else 0.014) * H * np.cos(2 * turn + (0.4 if run else 2.6))
     over = rotation(1, yaw) @ np.array([0.016 * H * np.sin(turn - 0.2), 0, 0])
-    pelvis = np.array([at[0], float(score.legs.at("pelvis")[1]) - (0.035 if run else 0.022) * H + bob, at[1]]) + over
+    pelvis = (
+        np.array([at[0], float(score.legs.at("pelvis")[1]) - (0.035 if run else 0.022) * H + bob, at[1]])
+        + over
+    )
     swing = -0.13 * float(np.cos(turn - 0.6)) * (score.kind in ("walk", "run", "march"))
     return Stance(
         pelvis,
@@ -284,12 +287,16 @@ class Gesture:
 
     def angles(self, beats: float) -> Float[np.ndarray, "side angle"]:
         """Flexion, abduction, twist, elbow, curl of both arms at this point of the music."""
-        moving = self.bases + self.amplitudes * np.sin(2 * np.pi * (self.harmonics[:, None] * beats + self.phases))
+        moving = self.bases + self.amplitudes * np.sin(
+            2 * np.pi * (self.harmonics[:, None] * beats + self.phases)
+        )
         moving[:, [1, 3]] = np.maximum(moving[:, [1, 3]], 0.02)
         return moving
 
 
-def sample_gesture(rng: np.random.Generator, kinds: list[str], bulk: float, energy: float, beat_hz: float) -> Gesture:
+def sample_gesture(
+    rng: np.random.Generator, kinds: list[str], bulk: float, energy: float, beat_hz: float
+) -> Gesture:
     """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes."""
     first = kinds[int(rng.integers(len(kinds)))]
     names = (first, "hang" if first == "wave" else first)
@@ -307,7 +314,9 @@ def sample_gesture(rng: np.random.Generator, kinds: list[str], bulk: float, ener
         most = FASTEST_RAD_S / (2 * np.pi * harmonic * beat_hz)
         amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
         # The main angle beats with the music; the others follow it loosely.
-        offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
+        offsets = (
+            phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
+        )
         sides.append(([*base, curl], [*amplitude, 0.05], [*offsets, phase], harmonic))
     return Gesture(*map(np.array, zip(*sides, strict=True)))
 
@@ -369,7 +378,9 @@ def sample_motion(
     beat = float(rng.uniform(*BEAT_HZ[tempo]))
     if chosen in OWN_BEAT_HZ:
         beat = float(rng.uniform(*OWN_BEAT_HZ[chosen]))
-    gestures = [sample_gesture(rng, TABLES["gestures_of_motion"][chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
+    gestures = [
+        sample_gesture(rng, TABLES["gestures_of_motion"][chosen], bulk, ENERGY[tempo], beat) for _ in range(2)
+    ]
     path = 0.0
     if chosen in ("walk", "run") and rng.random() < 0.7:
         path = float(rng.uniform(0.42, 0.65))

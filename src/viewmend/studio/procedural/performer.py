@@ -39,7 +39,11 @@ class ProceduralPerson:
 
 
 def draw_person(
-    seeds: np.random.SeedSequence, tempo: Tempo, kind: str | None, holding: bool | None, center: tuple[float, float]
+    seeds: np.random.SeedSequence,
+    tempo: Tempo,
+    kind: str | None,
+    holding: bool | None,
+    center: tuple[float, float],
 ) -> ProceduralPerson:
     """Draw a person. `kind` fixes the motion, `holding` whether something is in a hand; `center` is x and z, metres."""
     body_rng, cloth_rng, hair_rng, motion_rng, prop_rng = (np.random.default_rng(s) for s in seeds.spawn(5))
@@ -65,7 +69,9 @@ def draw_person(
         motion = replace(motion, grip=side)
         held = f" with a {thing}"
     sex = "woman" if person.femininity > 0.5 else "man"
-    words = f"{sex}, {person.height_m:.2f} m, {hair.words}, {outfit.words}, {motion.score.kind} ({tempo}){held}"
+    words = (
+        f"{sex}, {person.height_m:.2f} m, {hair.words}, {outfit.words}, {motion.score.kind} ({tempo}){held}"
+    )
     return ProceduralPerson(assemble(patches), skeleton, motion, person, words)
 
 
@@ -97,7 +103,9 @@ class ProceduralPerformer:
             textures.append(part.texture_of_face + layer)
             first = first + len(part.mesh.vertices)
             layer = layer + len(part.textures)
-        vertices, normals, uv = zip(*((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True)
+        vertices, normals, uv = zip(
+            *((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True
+        )
         mesh = Mesh(torch.cat(vertices), torch.cat(faces))
         every = tuple(texture for part in parts for texture in part.textures)
         return TexturedMesh(mesh, torch.cat(normals), torch.cat(uv), torch.cat(textures), every)

@@ -29,7 +29,9 @@ class Frame:
     def patch(self, local: Float[np.ndarray, "row column 3"], chart: Image, closed: bool = True) -> Patch:
         """A sheet given in the thing's own coordinates."""
         points = local @ self.axes.T + self.origin
-        return Patch(points, unit_grid(local.shape), one_joint(local.shape[:2], self.joint), chart, closed=closed)
+        return Patch(
+            points, unit_grid(local.shape), one_joint(local.shape[:2], self.joint), chart, closed=closed
+        )
 
 
 def turned_solid(frame: Frame, r: Values, y: Values, chart: Image, columns: int = 29) -> Patch:
@@ -88,7 +90,9 @@ def _wood(rng: np.random.Generator, canvas: Canvas) -> Image:
 def _print(rng: np.random.Generator, width: float, height: float) -> Image:
     fabric = sample_fabric(rng)
     canvas = Canvas(width, height, 400.0)
-    rim = np.minimum(np.minimum(canvas.y, height - canvas.y), np.minimum(canvas.x + width / 2, width / 2 - canvas.x))
+    rim = np.minimum(
+        np.minimum(canvas.y, height - canvas.y), np.minimum(canvas.x + width / 2, width / 2 - canvas.x)
+    )
     image = fabric.paint(canvas)
     return blend(image, 0.5 * image, edge(0.006 - rim, canvas))
 
@@ -124,7 +128,9 @@ def standing_prop(kind: str, rng: np.random.Generator, origin: Vector, yaw: floa
             grip = [cylinder(rod, 0.009, 0.3, plain_chart(np.full(3, 0.3))) for rod in rods]
             return [*box(frame, (0.42, 0.62, 0.24), _print(rng, 0.42, 0.62)), *grip]
         case "table":
-            return [profiled(frame, "table", _wood(rng, Canvas(0.5, 0.5, 300.0)), float(rng.uniform(0.5, 0.75)))]
+            return [
+                profiled(frame, "table", _wood(rng, Canvas(0.5, 0.5, 300.0)), float(rng.uniform(0.5, 0.75)))
+            ]
         case "lamp":
             tall = float(rng.uniform(1.2, 1.6))
             metal = plain_chart(np.full(3, rng.uniform(0.1, 0.6)))
@@ -167,7 +173,11 @@ def held_prop(kind: str, rng: np.random.Generator, body: Body, side: str) -> lis
     color = hsv(rng.random(), rng.uniform(0.2, 0.9), rng.uniform(0.3, 0.95))
     match kind:
         case "staff":
-            return [cylinder(frame.moved(0.0, -0.6, 0.0), 0.013, float(rng.uniform(1.0, 1.3)), _print(rng, 0.1, 0.9))]
+            return [
+                cylinder(
+                    frame.moved(0.0, -0.6, 0.0), 0.013, float(rng.uniform(1.0, 1.3)), _print(rng, 0.1, 0.9)
+                )
+            ]
         case "cup" | "bottle":
             return [profiled(frame, kind, _print(rng, 0.2, 0.15), columns=17)]
         case "ball":

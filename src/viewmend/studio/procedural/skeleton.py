@@ -34,7 +34,11 @@ LEG = ("thigh", "shin", "foot", "toe")
 SIDES = ("left", "right")
 _CHAINS = (
     SPINE,
-    *((root, *(f"{s}_{name}" for name in limb)) for s in SIDES for root, limb in (("upper", ARM), ("pelvis", LEG))),
+    *(
+        (root, *(f"{s}_{name}" for name in limb))
+        for s in SIDES
+        for root, limb in (("upper", ARM), ("pelvis", LEG))
+    ),
     *(("pelvis", f"skirt{column}_high", f"skirt{column}_low") for column in range(SKIRT_COLUMNS)),
     ("head", "tail"),
 )
@@ -260,7 +264,9 @@ def _reachable(skeleton: Skeleton, stance: Stance, R: Rotation) -> Vector:
     for i, side in enumerate(SIDES):
         ankle, _ = _ankle(skeleton, side, stance.feet[i])
         hip = pelvis + R @ (skeleton.at(f"{side}_thigh") - skeleton.at("pelvis"))
-        leg = skeleton.length(f"{side}_thigh", f"{side}_shin") + skeleton.length(f"{side}_shin", f"{side}_foot")
+        leg = skeleton.length(f"{side}_thigh", f"{side}_shin") + skeleton.length(
+            f"{side}_shin", f"{side}_foot"
+        )
         flat = float(np.hypot(*(hip - ankle)[[0, 2]]))
         highest = ankle[1] + np.sqrt(max((0.992 * leg) ** 2 - flat**2, 0.01))
         # max(0, missing), rounded within two centimetres: a kink would jerk the whole body.
@@ -314,7 +320,10 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     weight = pelvis.T @ np.array([0.0, -1.0, 0.0])
     bones = {}
     for segment, first, last in (("high", "thigh", "shin"), ("low", "shin", "foot")):
-        ends = [[skeleton.moved(f"{s}_{part}", world[INDEX[f"{s}_{part}"]]) for part in (first, last)] for s in SIDES]
+        ends = [
+            [skeleton.moved(f"{s}_{part}", world[INDEX[f"{s}_{part}"]]) for part in (first, last)]
+            for s in SIDES
+        ]
         bones[segment] = np.array([pelvis.T @ unit(end - start) for start, end in ends] + [weight])
     azimuth = 2 * np.pi * np.arange(SKIRT_COLUMNS) / SKIRT_COLUMNS
     outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], 1)
