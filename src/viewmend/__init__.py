@@ -1,7 +1,7 @@
 """Real-time inpainting of free-viewpoint video.
 
-`viewmend.__all__` lists the public names. Each is imported on first use, so that `import viewmend` is instant.
-Importing the package also lets PyTorch's idle threads sleep (`utils/openmp.py`).
+`viewmend.__all__` lists the public names. Each is imported on first use, so that `import viewmend`
+is instant. Importing the package also lets PyTorch's idle threads sleep (`utils/openmp.py`).
 """
 
 from importlib import import_module

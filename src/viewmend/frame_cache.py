@@ -180,8 +180,9 @@ def evict(
 ) -> list[CachedFrame]:
     """Drop frames until the others fit into `memory_mb`; the frame at `time` stays.
 
-    First go the least recently used of those that the window at `time`, which reaches back `window_frames`, does not
-    need; then the oldest of the window. Without a limit, all that are more than `WINDOW` frames before `time` go.
+    First go the least recently used of those that the window at `time`, which reaches back
+    `window_frames`, does not need; then the oldest of the window. Without a limit, all that are
+    more than `WINDOW` frames before `time` go.
 
     Returns:
         What was dropped of the window.

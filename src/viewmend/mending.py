@@ -86,8 +86,8 @@ class Mender(ViewSequence):
     ) -> None:
         """Create a viewer of an empty stream, as `ViewSequence` does.
 
-        `protocol` says what `mend` may know of the mask of the held-out camera; with 'predicted-mask', `mask_model`
-        predicts it.
+        `protocol` says what `mend` may know of the mask of the held-out camera; with
+        'predicted-mask', `mask_model` predicts it.
         """
         super().__init__(inpainter, config, bounds, exclude, quality, error_model)
         self._protocol: Protocol = protocol
@@ -97,8 +97,9 @@ class Mender(ViewSequence):
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
         """Complete and score the next view; several views of the same frame may follow each other.
 
-        `truth`, one view at the target's pose, is what the result is scored against; unless the protocol is `strict`,
-        its mask is used, too. There are no scores where neither the frame nor the truth has a subject.
+        `truth`, one view at the target's pose, is what the result is scored against; unless the
+        protocol is `strict`, its mask is used, too. There are no scores where neither the frame nor
+        the truth has a subject.
 
         Raises:
             ValueError: the inpainter does not return a completed view (`Inpainter.step_on`).

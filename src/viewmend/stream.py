@@ -2,8 +2,9 @@
 
     MultiViewFrame ──add_frame──▶ CachedFrame ──render──▶ IncompleteView ──mend──▶ CompletedView
 
-All commands that render, the live server and the evaluation use `Stream` (section 9). What depends on the rig or on
-a frame is computed once and shared by all viewers; what depends on a viewer is a `State`, passed in and returned.
+All commands that render, the live server and the evaluation use `Stream` (section 9). What depends
+on the rig or on a frame is computed once and shared by all viewers; what depends on a viewer is a
+`State`, passed in and returned.
 """
 
 import logging
@@ -68,9 +69,10 @@ class StreamConfig:
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 2000.0
-    """Above this, frames are dropped: first those that the inpainter's temporal window does not need, the least
-    recently used first. The default holds the window of `paper-small` for 8 cameras of 512 x 512 pixels, all of them
-    encoded. None: frames are dropped once no temporal window reaches back to them."""
+    """Above this, frames are dropped: first those that the inpainter's temporal window does not
+    need, the least recently used first. The default holds the window of `paper-small` for 8 cameras
+    of 512 x 512 pixels, all of them encoded. None: frames are dropped once no temporal window
+    reaches back to them."""
 
     def __post_init__(self) -> None:
         if self.geometry not in get_args(Geometry):
@@ -133,13 +135,13 @@ class Stream:
             inpainter: completes the views, e.g. `load_inpainter("views")`.
             config: parameters of geometry, rendering and memory.
             bounds: the volume that may contain the subject; None to find it from the masks.
-            error_model: predicts errors and depth in place of `inpainter`, if that does not; needed for the error rule
-                'predicted', for `RenderQuality.refine_fraction` and for the geometry 'fused'
-                (`registry.error_model_for`).
+            error_model: predicts errors and depth in place of `inpainter`, if that does not; needed
+                for the error rule 'predicted', for `RenderQuality.refine_fraction` and for the
+                geometry 'fused' (`registry.error_model_for`).
 
         Raises:
-            ValueError: `inpainter` is a name, a class or anything else than an inpainter; or the geometry is 'fused',
-                and no model predicts depth.
+            ValueError: `inpainter` is a name, a class or anything else than an inpainter; or the
+                geometry is 'fused', and no model predicts depth.
         """
         if not isinstance(inpainter, Inpainter):
             raise ValueError(
@@ -188,17 +190,19 @@ class Stream:
     ) -> CachedFrame:
         """Add a frame and compute its geometry proxy. A frame whose time is cached already is not replaced.
 
-        Frames may come in any order and with gaps. Views of a frame whose masks are empty show the background alone.
+        Frames may come in any order and with gaps. Views of a frame whose masks are empty show the
+        background alone.
 
         Args:
             frame: the cameras' images; masks are needed unless `geometry` is given.
-            geometry: replaces the visual hull. `view` and `render` need a `GeometryProxy`, `mend` any depth provider.
+            geometry: replaces the visual hull. `view` and `render` need a `GeometryProxy`, `mend`
+                any depth provider.
             carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
-            ValueError: images, masks or cameras have another type, shape or range than their fields say; `geometry` has
-                no method `depth`; or none is given, and the frame has no masks, a single camera, or
-                cameras that look away from each other.
+            ValueError: images, masks or cameras have another type, shape or range than their fields
+                say; `geometry` has no method `depth`; or none is given, and the frame has no masks,
+                a single camera, or cameras that look away from each other.
         """
         if frame.time not in self._frames:
             frame.check()
@@ -230,8 +234,9 @@ class Stream:
     def adopt(self, cached: CachedFrame) -> CachedFrame:
         """Add a frame that another stream has prepared, with its geometry and everything computed from it so far.
 
-        Nothing is copied, and nothing that is computed later is shared. A frame whose time is cached already is not
-        replaced, but it takes over the depths and encodings that it does not have yet.
+        Nothing is copied, and nothing that is computed later is shared. A frame whose time
+        is cached already is not replaced, but it takes over the depths and encodings that
+        it does not have yet.
 
         Args:
             cached: the frame, on the device on which this stream's views are rendered.
@@ -292,9 +297,9 @@ class Stream:
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
-            ValueError: `target` is not one camera, the frame is not cached, its geometry is not a `GeometryProxy`, no
-                camera is left, `exclude` is a string, `target_mask` is not a mask of the view,
-                or the error rule needs a model that predicts errors.
+            ValueError: `target` is not one camera, the frame is not cached, its geometry is not a
+                `GeometryProxy`, no camera is left, `exclude` is a string, `target_mask` is not a
+                mask of the view, or the error rule needs a model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
         part, _ = self._with_error_mask(part, evidence, RenderQuality(), exclude)
@@ -309,8 +314,8 @@ class Stream:
     ) -> StreamView:
         """Complete a view of a cached frame that `render`, or any other renderer, made.
 
-        `view.source_views` must name the cameras that coloured it, and `view.candidate_views` all cameras that may be
-        used, the closest first: the inpainter samples their images.
+        `view.source_views` must name the cameras that coloured it, and `view.candidate_views` all
+        cameras that may be used, the closest first: the inpainter samples their images.
 
         Args:
             view: the view to complete.
@@ -319,10 +324,10 @@ class Stream:
             exclude: names of cameras whose images must not be used; those without an image are ignored.
 
         Raises:
-            ValueError: the view's frame is not cached; the view names no camera or one that is not in the frame; an
-                image of it, or the depth of the frame's geometry, has another type, shape or range than its field says;
-                `exclude` is a string; the inpainter does not return a completed view
-                of it; or `quality` needs a model that predicts errors.
+            ValueError: the view's frame is not cached; the view names no camera or one that is not
+                in the frame; an image of it, or the depth of the frame's geometry, has another
+                type, shape or range than its field says; `exclude` is a string; the inpainter does
+                not return a completed view of it; or `quality` needs a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)

@@ -5,9 +5,10 @@
     IncompleteView   a rendered novel view with its error mask: what an inpainter completes
     CompletedView    the completed view, with alpha, confidence and depth where the model predicts them
 
-All are frozen. Images are tensors of shape (channel, height, width) or (height, width); colours are RGB. Novel views
-are in [0, 1] and on black, that is, multiplied by alpha. Camera axes are OpenCV's, pixel centres are at +0.5, lengths
-are in metres. The symbols I, M, F, E and G, and the section numbers, are those of the paper.
+All are frozen. Images are tensors of shape (channel, height, width) or (height, width); colours are
+RGB. Novel views are in [0, 1] and on black, that is, multiplied by alpha. Camera axes are OpenCV's,
+pixel centres are at +0.5, lengths are in metres. The symbols I, M, F, E and G, and the section
+numbers, are those of the paper.
 """
 
 import math
@@ -33,8 +34,8 @@ OVERSHOOT = 0.4
 SUM_TOLERANCE = 1e-2
 """Each pixel's weights have a sum s of 0 or 1; s (1 - s) may differ from 0 by this much."""
 NOISE = 0.01
-"""Masks of values 0 and 1 (of 255) show no subject, but a matting's noise, if at most this fraction of the pixels
-is 1; if more are, they were probably made with values from 0 to 1."""
+"""Masks of values 0 and 1 (of 255) show no subject, but a matting's noise, if at most this fraction
+of the pixels is 1; if more are, they were probably made with values from 0 to 1."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
 """Messages about images of another type than float32 suggest this."""
 
@@ -42,7 +43,8 @@ TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
 class _LazyStacks:
     """Image fields that are given camera by camera, and stacked into one tensor when they are first read.
 
-    Selecting cameras this way copies nothing: a view that needs a few pixels of each camera need not pay for the rest.
+    Selecting cameras this way copies nothing: a view that needs a few pixels of each camera need
+    not pay for the rest.
     """
 
     _parts: dict[str, Sequence[Tensor]]
@@ -251,8 +253,8 @@ class IncompleteView:
     mask: Float[Tensor, "height width"]
     """M, in [0, 1]: 1 where the geometry proxy covers the pixel."""
     error: Float[Tensor, "height width"]
-    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where it must not change. With some error rules, pixels to
-    inpaint already have a colour, which may be wrong."""
+    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where it must not change. With some
+    error rules, pixels to inpaint already have a colour, which may be wrong."""
     depth: Float[Tensor, "height width"]
     """z-depth of the proxy, metres; 0 where there is none."""
     source_views: tuple[str, ...]
@@ -262,17 +264,19 @@ class IncompleteView:
     time: int
     """Index of the frame."""
     candidate_views: tuple[str, ...] = ()
-    """Names of all cameras that an inpainter may use, the closest first; () if the renderer does not name them."""
+    """Names of all cameras that an inpainter may use, the closest first; () if the renderer does
+    not name them."""
     silhouettes: Silhouettes | None = None
-    """The masks of these cameras in the same frame, which bound the subject more exactly than the proxy; None if the
-    renderer does not provide them."""
+    """The masks of these cameras in the same frame, which bound the subject more exactly than the
+    proxy; None if the renderer does not provide them."""
     fade: Float[Tensor, "height width"] | None = None
-    """Predicted background fraction, in [0, 1], of pixels with E > 0 that are only attenuated; 0 where a pixel is to be
-    re-synthesised. None: all pixels with E > 0 are."""
+    """Predicted background fraction, in [0, 1], of pixels with E > 0 that are only attenuated; 0
+    where a pixel is to be re-synthesised. None: all pixels with E > 0 are."""
     target_mask: Float[Tensor, "height width"] | None = None
-    """M_t, the subject's true mask in this view, in [0, 1], where one is known: from a matting of the target camera, a
-    better silhouette, or the alpha of another model. It may be smaller than the proxy: the completed view shows nothing
-    outside of it. `rgb` is not multiplied by it. None: nothing is known beyond the proxy's silhouette."""
+    """M_t, the subject's true mask in this view, in [0, 1], where one is known: from a matting of
+    the target camera, a better silhouette, or the alpha of another model. It may be smaller than
+    the proxy: the completed view shows nothing outside of it. `rgb` is not multiplied by it. None:
+    nothing is known beyond the proxy's silhouette."""
 
     @property
     def silhouette(self) -> Float[Tensor, "height width"]:
@@ -406,7 +410,8 @@ class CompletedView:
     """Coverage of each pixel by the subject, in [0, 1]; `rgb` is multiplied by it. None if nothing is
     known beyond the view's silhouette."""
     confidence: Float[Tensor, "height width"] | None = None
-    """Confidence of the model in each pixel, in [0, 1]; 0 where there is no subject. None if it predicts none."""
+    """Confidence of the model in each pixel, in [0, 1]; 0 where there is no subject. None if it
+    predicts none."""
     depth: Float[Tensor, "height width"] | None = None
     """Refined z-depth of the subject, metres, 0 where there is none. None if the model predicts none."""
 
@@ -424,8 +429,8 @@ class CompletedView:
     def straight_rgb(self) -> Float[Tensor, "3 height width"]:
         """Fhat divided by `opacity`, in [0, 1]: straight (not premultiplied) colours.
 
-        Pixels of almost no opacity take the colour of their neighbours, so that no dark fringe appears when the image
-        is scaled or compressed; far from the subject the image is black.
+        Pixels of almost no opacity take the colour of their neighbours, so that no dark fringe
+        appears when the image is scaled or compressed; far from the subject the image is black.
         """
         opacity = self.opacity[None]
         near = F.avg_pool2d(torch.cat([self.rgb, opacity])[None], 2 * NEAR_PX + 1, 1, NEAR_PX)[0]

@@ -37,7 +37,8 @@ class ViewSequence:
 
         Args:
             inpainter: completes the views.
-            config: parameters of geometry, rendering and memory; by default frames are kept as long as windows reach.
+            config: parameters of geometry, rendering and memory; by default frames are kept as long
+                as windows reach.
             bounds: the volume that may contain the subject; None to find it from the masks.
             exclude: names of cameras whose images must not be used.
             quality: how much work a view may cost.
@@ -83,8 +84,8 @@ class ViewSequence:
         Args:
             target: the novel view's camera (one view).
             time: index of the frame.
-            history_of: the rendered view. Its context in frames that were added without a view is encoded first,
-                outside of the measured time.
+            history_of: the rendered view. Its context in frames that were added without a view is
+                encoded first, outside of the measured time.
             target_mask: the subject's mask in the novel view, if it is known.
         """
         for stream in (self._warm_up, self.stream):

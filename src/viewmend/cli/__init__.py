@@ -1,14 +1,16 @@
 """The `viewmend` command: one module per subcommand.
 
-`cli/<command>.py` holds a frozen, keyword-only dataclass `Options` and a function `run(options) -> int` that returns
-the exit code. tyro turns the field docstrings into the option help and the class docstring into the command help. A
-command whose defaults depend on its first argument also has `parse(arguments, prog) -> Options`. No command module
-imports torch, cv2 or rich at the top, so that help appears at once. Results go to standard output, all other messages
-to standard error (`console.py`); with `--json`, standard output is one JSON value.
+`cli/<command>.py` holds a frozen, keyword-only dataclass `Options` and a function
+`run(options) -> int` that returns the exit code. tyro turns the field docstrings into the option
+help and the class docstring into the command help. A command whose defaults depend on its first
+argument also has `parse(arguments, prog) -> Options`. No command module imports torch, cv2 or rich
+at the top, so that help appears at once. Results go to standard output, all other messages to
+standard error (`console.py`); with `--json`, standard output is one JSON value.
 
-Exit codes: 2 for a `ValueError` (`CaptureError` is one) or an `OSError`, reported in one line; 1 for failures that a
-report lists, or with a traceback for any other exception, which is a bug; 130 after Ctrl-C and 143 after SIGTERM.
-Partial output is removed, except what a repeated command resumes from.
+Exit codes: 2 for a `ValueError` (`CaptureError` is one) or an `OSError`, reported in one
+line; 1 for failures that a report lists, or with a traceback for any other exception, which
+is a bug; 130 after Ctrl-C and 143 after SIGTERM. Partial output is removed, except what a
+repeated command resumes from.
 """
 
 import importlib

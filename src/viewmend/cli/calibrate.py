@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 class Options:
     """Find the cameras of a rig, or refine them, and write them as OUT/cameras.json.
 
-    With --board, SOURCE holds a video or a folder of images for each camera, named after it, that shows a ChArUco board
-    being carried around; all begin at the same moment. OUT/residuals.png shows the reprojection errors. With
-    --silhouettes, SOURCE is a capture with masks, and nothing is written unless held-out cameras agree better with the
-    others afterwards. OUT/cameras.json refers to the files of SOURCE: copy it there, or next to footage with these
-    names.
+    With --board, SOURCE holds a video or a folder of images for each camera, named after it, that
+    shows a ChArUco board being carried around; all begin at the same moment. OUT/residuals.png
+    shows the reprojection errors. With --silhouettes, SOURCE is a capture with masks, and nothing
+    is written unless held-out cameras agree better with the others afterwards. OUT/cameras.json
+    refers to the files of SOURCE: copy it there, or next to footage with these names.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]

@@ -23,8 +23,8 @@ WIDE_DEG = 60.0
 class Options:
     """Check and describe a capture.
 
-    Checks that all files exist, that masks, calibration and images of one frame agree, and that cameras and videos are
-    synchronised.
+    Checks that all files exist, that masks, calibration and images of one frame agree, and that
+    cameras and videos are synchronised.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]

@@ -30,13 +30,15 @@ class ViewOptions:
     """How views are rendered, and which of their pixels are inpainted."""
 
     num_source_views: int = 3
-    """Number of source cameras: those closest to the view, which colour it. Our models choose their own context."""
+    """Number of source cameras: those closest to the view, which colour it. Our models choose their
+    own context."""
     view_selection: Literal["angle", "direction"] = "angle"
-    """How closeness is measured: by the 'angle' at the subject, or by viewing 'direction', an option of RIFTCast."""
+    """How closeness is measured: by the 'angle' at the subject, or by viewing 'direction', an
+    option of RIFTCast."""
     error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that leave correct pixels
-    unchanged; 'predicted', which a model predicts to be wrong; or FILE.py:NAME, your own rule. By default, the rule
-    that the model is made for."""
+    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that
+    leave correct pixels unchanged; 'predicted', which a model predicts to be wrong; or
+    FILE.py:NAME, your own rule. By default, the rule that the model is made for."""
     refine_fraction: float = 0.15
     """With the error rule 'predicted': largest fraction of the subject to inpaint, all holes first."""
 
@@ -58,12 +60,12 @@ class PreparationOptions:
     """What is corrected in a capture."""
 
     align: Annotated[bool, NEGATED] = True
-    """Use the calibration as it is, and do not look for cameras that are out of sync. By default, a shift that all
-    images share (for example from another convention for pixel centres) is estimated from the masks of one frame, and
-    undone if the masks then agree better."""
+    """Use the calibration as it is, and do not look for cameras that are out of sync. By default, a
+    shift that all images share (for example from another convention for pixel centres) is estimated
+    from the masks of one frame, and undone if the masks then agree better."""
     match_colours: Annotated[bool, NEGATED] = True
-    """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one frame, if they then
-    agree better on held-out surface points."""
+    """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one
+    frame, if they then agree better on held-out surface points."""
 
 
 def check_least(options: object, **least: int) -> None:

@@ -18,7 +18,8 @@ _Item = TypeVar("_Item")
 INTERVAL_S = 30.0
 """Seconds between progress lines if standard error is not a terminal."""
 REPEATED_S = 1.0
-"""Ctrl-C so soon after the first signal is the same request: torchrun and `timeout` pass it on, and signal again."""
+"""Ctrl-C so soon after the first signal is the same request: torchrun and `timeout` pass it on, and
+signal again."""
 
 
 def track(items: Iterable[_Item], description: str, total: int | None = None) -> Iterator[_Item]:
@@ -101,8 +102,8 @@ def say(message: str) -> None:
 def escape_unencodable() -> None:
     """Make standard output and error escape the characters that their encoding lacks.
 
-    Names of cameras and folders may have letters of any script, but the encoding of a console or pipe may be as small
-    as cp1252 or ASCII.
+    Names of cameras and folders may have letters of any script, but the encoding of a console or
+    pipe may be as small as cp1252 or ASCII.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -26,8 +26,8 @@ MIN_GAP = 4
 class Options:
     """Render and complete a moving procedural scene, captured by six cameras, from a moving camera. Needs no data.
 
-    OUT gets demo.mp4 (rendered, completed and true views side by side) and contact_sheet.png. The table compares
-    the rendered view, OpenCV's Telea and the model with the truth.
+    OUT gets demo.mp4 (rendered, completed and true views side by side) and contact_sheet.png. The
+    table compares the rendered view, OpenCV's Telea and the model with the truth.
     """
 
     out: Path = Path("out/demo")

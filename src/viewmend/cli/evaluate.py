@@ -39,27 +39,31 @@ class RunOptions:
     out: Path
     """Folder for the results."""
     weights: Path | None = None
-    """Folder of published weights, searched first; without weights, methods and metrics are n/a (viewmend weights)."""
+    """Folder of published weights, searched first; without weights, methods and metrics are n/a
+    (viewmend weights)."""
     performers: Path | None = None
-    """Folder of the people of set Q: glTF characters in it or in test/; BVH motions in motions/test/, in motions/, or
-    next to the characters."""
+    """Folder of the people of set Q: glTF characters in it or in test/; BVH motions in
+    motions/test/, in motions/, or next to the characters."""
     motions: Path | None = None
     """Folder of BVH motions, if they are elsewhere."""
     format: str | None = None
     """Format of the captures (docs/formats.md); recognised by default."""
     inputs: str = "all"
-    """Input cameras of a capture: all, or a number of evenly spaced ones; several values are separated by commas."""
+    """Input cameras of a capture: all, or a number of evenly spaced ones; several values are
+    separated by commas."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the held-out camera: nothing ('strict'); its mask, which cuts and composites the view
-    ('target-mask', as in the paper); its mask, which only carves the hull ('hull-with-target-mask'); or nothing, but
-    the alpha that 'views' predicts stands for its mask ('predicted-mask')."""
+    """What is known of the held-out camera: nothing ('strict'); its mask, which cuts and composites
+    the view ('target-mask', as in the paper); its mask, which only carves the hull
+    ('hull-with-target-mask'); or nothing, but the alpha that 'views' predicts stands for its mask
+    ('predicted-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None
-    """Number of frames of each scene; by default 10 of P and Q, and all of a capture. Long sets have 41, of which the
-    last 10 are scored."""
+    """Number of frames of each scene; by default 10 of P and Q, and all of a capture. Long sets
+    have 41, of which the last 10 are scored."""
     every: int = 1
-    """Use one scene in n of each set, for a quick look at all kinds of scenes; of a capture, every n-th camera."""
+    """Use one scene in n of each set, for a quick look at all kinds of scenes; of a capture, every
+    n-th camera."""
     scenes: int | None = None
     """Largest number of scenes of each set, after --every."""
     size: int = 512
@@ -74,15 +78,17 @@ class RunOptions:
     jobs: int = 1
     """Number of processes. Milliseconds are comparable only within a run."""
     ray: str | None = None
-    """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
+    """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs
+    viewmend[ray])."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "hull"
-    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
-    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that
+    the model 'views' predicts all around the subject. The latter takes several times as long as a
+    view, once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
-    same on a machine."""
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
+    for it, and always the same on a machine."""
     shown: int = 12
     """Scenes of each set with images in report.html; sheets/ has all of them."""
 
@@ -91,20 +97,21 @@ class RunOptions:
 class Options(RunOptions):
     """Compare methods on views of held-out cameras, and write tables and images to --out.
 
-    OUT gets report.html, report.md, report.csv, report.json, sheets/ with one image per scene, and cells/ with all
-    results: an interrupted run resumes from there, and only new methods and scenes are computed. docs/evaluation.md
-    defines the scores.
+    OUT gets report.html, report.md, report.csv, report.json, sheets/ with one image per scene, and
+    cells/ with all results: an interrupted run resumes from there, and only new methods and scenes
+    are computed. docs/evaluation.md defines the scores.
     """
 
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET|CAPTURE...")]
-    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same with 41 frames,
-    of which the last ten are scored. P-turn: people who turn. R48, R34: rigs of 48 and 34 cameras, as in the paper;
-    one frame with a full window is scored, also of glTF people with --performers. CAPTURE: each camera of a capture is
-    held out in turn; or a file of `viewmend splits`, whose test scenes are used."""
+    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the
+    same with 41 frames, of which the last ten are scored. P-turn: people who turn. R48, R34: rigs
+    of 48 and 34 cameras, as in the paper; one frame with a full window is scored, also of glTF
+    people with --performers. CAPTURE: each camera of a capture is held out in turn; or a file of
+    `viewmend splits`, whose test scenes are used."""
     methods: str = "all"
-    """Names separated by commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model,
-    a model's folder, a baseline such as dstt-o-def, FILE.py:NAME; 'all' for all shipped methods, 'baselines' for those
-    of the paper's Table 1."""
+    """Names separated by commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled,
+    rgvi, a shipped model, a model's folder, a baseline such as dstt-o-def, FILE.py:NAME; 'all' for
+    all shipped methods, 'baselines' for those of the paper's Table 1."""
     json: bool = False
     """Write the report to standard output as JSON, in place of the tables."""
 

@@ -11,9 +11,10 @@ import tyro
 class Options:
     """Export a model as an AOTInductor package (libtorch, C++) or as ONNX.
 
-    The file completes one view of one frame: its inputs are the rendered view, its camera, and the rig's images, masks
-    and calibration, of 64 to 4096 pixels a side; its outputs are colours, alpha, confidence and depth
-    (docs/guide/export.md). A package is compiled for the processor of this machine; ONNX runs anywhere.
+    The file completes one view of one frame: its inputs are the rendered view, its camera, and the
+    rig's images, masks and calibration, of 64 to 4096 pixels a side; its outputs are colours,
+    alpha, confidence and depth (docs/guide/export.md). A package is compiled for the processor of
+    this machine; ONNX runs anywhere.
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = "views"

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 class Options:
     """Export a capture as a scene for 3D engines.
 
-    Written to OUT, per frame: the hull in the cameras' colours (hull/*.glb and *.ply) and the points of the completed
-    views (points/*.ply). Per view and frame: its image with alpha (rgba/VIEW/*.png) and its z-depth in metres as 32-bit
-    float (depth/VIEW/*.exr, 0 where there is no subject). And the cameras of the rig and of the views, as USD
-    (cameras.usda) and in a script that opens everything in Blender (open_in_blender.py). Metres, +y up.
+    Written to OUT, per frame: the hull in the cameras' colours (hull/*.glb and *.ply) and the
+    points of the completed views (points/*.ply). Per view and frame: its image with alpha
+    (rgba/VIEW/*.png) and its z-depth in metres as 32-bit float (depth/VIEW/*.exr, 0 where there is
+    no subject). And the cameras of the rig and of the views, as USD (cameras.usda) and in a script
+    that opens everything in Blender (open_in_blender.py). Metres, +y up.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -35,7 +36,8 @@ class Options:
     views: int = 8
     """Number of views around the subject that are completed in every frame."""
     path: Path | None = None
-    """A JSON file of views to use instead, as for `viewmend mend --path`; all are completed in every frame."""
+    """A JSON file of views to use instead, as for `viewmend mend --path`; all are completed in
+    every frame."""
     frames: str | None = None
     """Frames to export, as FIRST:END by index; either may be omitted."""
     max_image_size: int | None = None
@@ -48,11 +50,12 @@ class Options:
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "hull"
-    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
-    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that
+    the model 'views' predicts all around the subject. The latter takes several times as long as a
+    view, once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
-    same on a machine."""
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
+    for it, and always the same on a machine."""
 
 
 def run(options: Options) -> int:

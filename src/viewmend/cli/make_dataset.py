@@ -21,8 +21,9 @@ Item = TypeVar("Item")
 class Options:
     """Write training samples as tar files, for viewmend train RECIPE --shards: viewmend make-dataset RECIPE --out DIR.
 
-    Samples are of the recipe's kind (views by default): compressed scenes for views, sampled rays of single pixels for
-    rays, views with their context for the others. The same command resumes a run that was stopped.
+    Samples are of the recipe's kind (views by default): compressed scenes for views, sampled rays
+    of single pixels for rays, views with their context for the others. The same command resumes a
+    run that was stopped.
     """
 
     recipe: Annotated[str, HIDDEN]

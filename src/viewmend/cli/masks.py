@@ -21,10 +21,12 @@ class Options:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """New folder for the capture with masks."""
     method: Literal["person", "plate", "chroma", "alpha", "onnx"] = "person"
-    """person: a person-segmentation network, needs nothing else. plate: difference from a clean plate. chroma: green
-    or blue screen. alpha: the images' alpha channel. onnx: a matting network of your own."""
+    """person: a person-segmentation network, needs nothing else. plate: difference from a clean
+    plate. chroma: green or blue screen. alpha: the images' alpha channel. onnx: a matting network
+    of your own."""
     plate: str | None = None
-    """Clean plates: a path with {camera} in it, or a folder with an image or video named after each camera."""
+    """Clean plates: a path with {camera} in it, or a folder with an image or video named
+    after each camera."""
     plate_frames: str | None = None
     """Frames without the subject, as FIRST:END by index; their median is the clean plate."""
     key: Literal["green", "blue"] = "green"

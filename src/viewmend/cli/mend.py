@@ -21,17 +21,18 @@ if TYPE_CHECKING:
 class Options:
     """Render novel views of a capture and inpaint them.
 
-    OUT gets the completed views (completed.mp4, or completed/*.png for a single view), the views as rendered
-    (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be completed), the true image of a
-    held-out camera (true/*.png), rendered, completed and true views side by side (compared.mp4), and
-    contact_sheet.png.
+    OUT gets the completed views (completed.mp4, or completed/*.png for a single view), the views as
+    rendered (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be
+    completed), the true image of a held-out camera (true/*.png), rendered, completed and true views
+    side by side (compared.mp4), and contact_sheet.png.
 
-    With --leave-out, that camera's view is rendered without its image and mask, which then score it. PSNR in dB: of the
-    whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
-    ("valid"), and of the holes ("fg": inside the true mask), the holes also for OpenCV's Telea fill. SSIM: of the
-    whole image. LPIPS (AlexNet): of the whole image and of the subject. IoU: of alpha and the true mask. PSNRs are
-    means over frames; in the holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of
-    the hull's pixels that are holes, completed_fraction the fraction to be completed.
+    With --leave-out, that camera's view is rendered without its image and mask, which then score
+    it. PSNR in dB: of the whole image (also as rendered), of the subject (inside the true mask), of
+    the pixels that a camera colours ("valid"), and of the holes ("fg": inside the true mask), the
+    holes also for OpenCV's Telea fill. SSIM: of the whole image. LPIPS (AlexNet): of the whole
+    image and of the subject. IoU: of alpha and the true mask. PSNRs are means over frames; in the
+    holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of the
+    hull's pixels that are holes, completed_fraction the fraction to be completed.
 
     Images and scores are on a black background, or on white for a model trained on white (paper-small).
     """
@@ -39,45 +40,50 @@ class Options:
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
     """A capture with masks, in any supported format."""
     out: Path
-    """Folder for the results; created if missing. Results of an earlier run in it are replaced, other files kept."""
+    """Folder for the results; created if missing. Results of an earlier run in it are replaced,
+    other files kept."""
     leave_out: str | None = None
     """Name of a camera to hold out and whose view to render. Give either this or --path."""
     path: str | None = None
     """'orbit' circles the subject with its whole motion in view; options may follow, as in
-    orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON file with a list of 4x4
-    world_from_camera matrices (metres, OpenCV axes), or with an object of "world_from_camera" and optionally "K",
-    "width" and "height"; one pose per frame, or one for all."""
+    orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON
+    file with a list of 4x4 world_from_camera matrices (metres, OpenCV axes), or with an
+    object of "world_from_camera" and optionally "K", "width" and "height"; one pose per
+    frame, or one for all."""
     cameras: tuple[str, ...] = ()
     """Names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and composites the view
-    ('target-mask', as in the paper); its mask, which only carves the hull ('hull-with-target-mask'); or nothing, but
-    the alpha that 'views' predicts stands for its mask ('predicted-mask')."""
+    """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and
+    composites the view ('target-mask', as in the paper); its mask, which only carves the hull
+    ('hull-with-target-mask'); or nothing, but the alpha that 'views' predicts stands for its mask
+    ('predicted-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
-    """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea', 'reprojection',
-    'dstt-o-mul', FILE.py:NAME). By default 'views'."""
+    """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea',
+    'reprojection', 'dstt-o-mul', FILE.py:NAME). By default 'views'."""
     top_k: int | None = None
-    """For the paper's model: context tokens kept by pruning; by default the model's own number. Fewer is faster."""
+    """For the paper's model: context tokens kept by pruning; by default the model's own number.
+    Fewer is faster."""
     frames: str | None = None
     """Frames to use, as FIRST:END by index; all by default."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     alpha: bool = False
-    """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9 with alpha) if videos
-    are written. Alpha is the hull's mask if the model predicts none."""
+    """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9
+    with alpha) if videos are written. Alpha is the hull's mask if the model predicts none."""
     depth: bool = False
-    """Also write z-depth, depth/*.png: 16 bit, millimetres, 0 where there is no subject, 65535 for 65.535 m and more.
-    It is the hull's depth if the model predicts none."""
+    """Also write z-depth, depth/*.png: 16 bit, millimetres, 0 where there is no subject, 65535 for
+    65.535 m and more. It is the hull's depth if the model predicts none."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "hull"
-    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the model 'views'
-    predicts all around the subject. The latter takes several times as long as a view, once per frame."""
+    """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that
+    the model 'views' predicts all around the subject. The latter takes several times as long as a
+    view, once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
-    same on a machine."""
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
+    for it, and always the same on a machine."""
     json: bool = False
     """Write the scores to standard output as one JSON object, and nothing else."""
 

@@ -21,8 +21,9 @@ EXTRA_ROWS = ("telea", "navier-stokes", "nearest", "reprojection")
 class Options(RunOptions):
     """Make one of the paper's tables: 1, all methods; 2, on captures without retraining; 3, the ablation.
 
-    The paper's figures have columns of their own: its data, image size and GPU are different. Rows without weights are
-    n/a. OUT gets table1.md, .csv and .json (or 2, 3), and all files of viewmend evaluate.
+    The paper's figures have columns of their own: its data, image size and GPU are
+    different. Rows without weights are n/a. OUT gets table1.md, .csv and .json (or 2, 3),
+    and all files of viewmend evaluate.
     """
 
     table: Annotated[Literal[1, 2, 3], tyro.conf.Positional]
@@ -30,11 +31,13 @@ class Options(RunOptions):
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[P|Q|CAPTURE...]")] = ()
     """Sets as for viewmend evaluate; by default P, and Q with --performers. Table 2 needs captures."""
     ours: str = "paper-small"
-    """Models to add, by name or folder, separated by commas. The first that was trained by the recipe paper or
-    paper-small takes the row of the paper's model; all others have rows of their own."""
+    """Models to add, by name or folder, separated by commas. The first that was trained by
+    the recipe paper or paper-small takes the row of the paper's model; all others have rows
+    of their own."""
     models: Path | None = None
-    """Table 3: a folder of models named full, no-rope, no-past, single-camera, single-camera-no-masks; with -s0, -s1
-    ... appended for several seeds, as research/ablation.py leaves them."""
+    """Table 3: a folder of models named full, no-rope, no-past, single-camera,
+    single-camera-no-masks; with -s0, -s1 ... appended for several seeds, as research/ablation.py
+    leaves them."""
 
 
 def run(options: Options) -> int:

@@ -34,15 +34,17 @@ SERVE_ON_RAY = "viewmend.contrib.ray.replicas:serving"
 class Options:
     """Serve a web page for moving around the subject, live: as rendered, with holes, or completed.
 
-    The command prints the page's address. Only this machine can open it unless --host and --token are given. See
-    docs/live.md for the page, the time budget, single images over HTTP and live rigs.
+    The command prints the page's address. Only this machine can open it unless --host and
+    --token are given. See docs/live.md for the page, the time budget, single images over
+    HTTP and live rigs.
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = (
         "studio"
     )
-    """A capture with masks; a TOML file that lists the cameras of a live rig (docs/guide/live-rig.md); 'studio' for a
-    synthetic scene; or 'live' for a rig that pushes its frames."""
+    """A capture with masks; a TOML file that lists the cameras of a live rig
+    (docs/guide/live-rig.md); 'studio' for a synthetic scene; or 'live' for a rig that
+    pushes its frames."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     port: int = 8008
@@ -50,17 +52,18 @@ class Options:
     host: str = "127.0.0.1"
     """Address to bind to; an address that other machines can reach needs --token."""
     token: str | None = None
-    """Access token, at least 16 characters. It is visible in the process list; prefer --token-file or the environment
-    variable VIEWMEND_TOKEN."""
+    """Access token, at least 16 characters. It is visible in the process list; prefer --token-file
+    or the environment variable VIEWMEND_TOKEN."""
     token_file: Path | None = None
     """File whose first line is the token."""
     public_url: str | None = None
     """Address at which a reverse proxy serves the page, such as https://example.org/rig; needs --token."""
     model: str | None = None
-    """A shipped model's name or a model's folder; 'telea' and 'nearest' are classical fills. By default 'views'."""
+    """A shipped model's name or a model's folder; 'telea' and 'nearest' are classical fills. By
+    default 'views'."""
     render: Literal["page", "server"] = "page"
-    """Where moving views are drawn: in the page, from the frame's mesh and images, or on the server. Views at rest are
-    completed on the server either way."""
+    """Where moving views are drawn: in the page, from the frame's mesh and images, or on the
+    server. Views at rest are completed on the server either way."""
     fps: float | None = None
     """Frames per second; by default those of the capture."""
     budget_ms: float = 100.0
@@ -91,10 +94,11 @@ class Options:
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
-    same on a machine."""
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
+    for it, and always the same on a machine."""
     memory_mb: float = 3000.0
-    """Memory for frames and what is computed from them; with --ray, half of it is the processes' shared memory."""
+    """Memory for frames and what is computed from them; with --ray, half of it is the processes'
+    shared memory."""
 
 
 def run(options: Options) -> int:

@@ -11,8 +11,8 @@ import tyro
 class Options:
     """Write a subject-disjoint train/test split with one held-out camera per scene.
 
-    `viewmend evaluate OUT` runs the test scenes. The split follows from the captures' names and the seed: the same data
-    and file give the same scenes everywhere.
+    `viewmend evaluate OUT` runs the test scenes. The split follows from the captures' names and the
+    seed: the same data and file give the same scenes everywhere.
     """
 
     captures: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE...")]
@@ -20,8 +20,8 @@ class Options:
     out: Path
     """The JSON file; paths of captures in it are relative to its folder."""
     subject: str = "(.*)"
-    """Regular expression whose first group in a capture's name is the subject: '^(.*)_' for DNA-Rendering's 0012_11.
-    By default, each capture is a subject of its own."""
+    """Regular expression whose first group in a capture's name is the subject: '^(.*)_' for
+    DNA-Rendering's 0012_11. By default, each capture is a subject of its own."""
     test_fraction: float = 7 / 79
     """Fraction of the scenes for tests, at least; by default the paper's, 7 of 79."""
     scenes: int | None = None

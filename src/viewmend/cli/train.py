@@ -24,10 +24,11 @@ DEFAULT = "views"
 class Options:
     """Train a model: viewmend train RECIPE --out DIR [options].
 
-    RECIPE is one of: views (the default model), rays (its ray fill), paper and paper-small (the paper's model),
-    finetune CAPTURE (adapts a trained model to your own capture), or a published baseline: dstt, fuseformer, e2fgvi,
-    e2fgvi-hq. Each recipe has its own defaults. DIR gets the averaged weights, a log, validation images and
-    checkpoints; the same command resumes an interrupted run, and torchrun distributes it over processes and machines.
+    RECIPE is one of: views (the default model), rays (its ray fill), paper and paper-small (the
+    paper's model), finetune CAPTURE (adapts a trained model to your own capture), or a published
+    baseline: dstt, fuseformer, e2fgvi, e2fgvi-hq. Each recipe has its own defaults. DIR gets the
+    averaged weights, a log, validation images and checkpoints; the same command resumes an
+    interrupted run, and torchrun distributes it over processes and machines.
     """
 
     config: Annotated[TrainConfig, FLAT]

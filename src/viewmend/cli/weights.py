@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 class Options:
     """List the third-party weights that metrics and baselines can use, and verify those that are there.
 
-    Metrics and baselines without weights are n/a. LPIPS with AlexNet ships with this package, and viewmend weights get
-    downloads the other metrics' networks. Put all others into one of the listed folders, or name a folder in
-    VIEWMEND_WEIGHTS.
+    Metrics and baselines without weights are n/a. LPIPS with AlexNet ships with this package, and
+    viewmend weights get downloads the other metrics' networks. Put all others into one of the
+    listed folders, or name a folder in VIEWMEND_WEIGHTS.
     """
 
     json: bool = False

@@ -49,10 +49,11 @@ class PathFile(Struct, frozen=True):
 def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3"] | None = None) -> Cameras:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
-    The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object with that list as
-    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height". `origin_m`
-    is where the origin of `like` lies in the capture's own world (`origin_of`); poses that are nearer to it than to 0
-    are in that world. ValueError if the file has other content.
+    The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
+    with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
+    0.5), "width" and "height". `origin_m` is where the origin of `like` lies in the capture's own
+    world (`origin_of`); poses that are nearer to it than to 0 are in that world. ValueError if the
+    file has other content.
     """
     try:
         content = read_json(bounded_bytes(file))

@@ -71,7 +71,8 @@ class CameraReader:
     def read(self, time: int) -> CameraImages | None:
         """Read and undistort the images of the frame at index `time`, in which the camera is present.
 
-        None if its film is damaged there. CaptureError if a file is missing, unreadable, or not of the camera's size.
+        None if its film is damaged there. CaptureError if a file is missing, unreadable, or not of
+        the camera's size.
         """
         camera = self.camera
         path, where = self.locate("video" if camera.video else "image", time)

@@ -51,7 +51,8 @@ def open_capture(
         alpha: use the alpha channel of the images as masks.
 
     Raises:
-        CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see `CaptureFolder`).
+        CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see
+            `CaptureFolder`).
 
     Examples:
         >>> import tempfile
@@ -83,11 +84,12 @@ def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
 class CaptureFolder:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
-    A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by the times of their
-    frames. Images and masks are undistorted to pinhole images with the same K, and padded right and below to the
-    largest of the frame. The arguments are those of `open_capture`, which logs `issues`. CaptureError if `cameras.json`
-    is invalid; a camera has no files in any frame, or a frame has no camera; only some cameras have masks or depth; a
-    file lies outside the folder; or a camera name is unknown.
+    A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by
+    the times of their frames. Images and masks are undistorted to pinhole images with the same K,
+    and padded right and below to the largest of the frame. The arguments are those of
+    `open_capture`, which logs `issues`. CaptureError if `cameras.json` is invalid; a camera has no
+    files in any frame, or a frame has no camera; only some cameras have masks or depth; a file lies
+    outside the folder; or a camera name is unknown.
     """
 
     def __init__(
@@ -114,7 +116,8 @@ class CaptureFolder:
             None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
         )
         self.origin_m = calibration.origin_m
-        """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far from the folder's."""
+        """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far
+        from the folder's."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")
@@ -149,8 +152,9 @@ class CaptureFolder:
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
 
-        A camera whose film is damaged at this time is absent. Masks are 0 in a frame without a subject. CaptureError if
-        a file is unreadable or has the wrong size; IndexError if `time` is not in the capture.
+        A camera whose film is damaged at this time is absent. Masks are 0 in a frame without a
+        subject. CaptureError if a file is unreadable or has the wrong size; IndexError if `time` is
+        not in the capture.
         """
         if not 0 <= time < len(self.frame_ids):
             raise IndexError(
@@ -310,8 +314,9 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     """Match the films of a capture by time; None if it has no films and no offsets.
 
-    Numbered images count as films with the capture's frame rate, or else that of its first film. CaptureError if a film
-    cannot be decoded, no two show the same time, or offsets lack a frame rate.
+    Numbered images count as films with the capture's frame rate, or else that of its first
+    film. CaptureError if a film cannot be decoded, no two show the same time, or offsets
+    lack a frame rate.
     """
     cameras = calibration.cameras
     folder = calibration.folder

@@ -1,9 +1,10 @@
 """Colour matching of a rig: one affine RGB map per camera, fitted on surface points that several cameras see.
 
-The maps are fitted jointly by iteratively reweighted least squares (Huber, "Robust estimation of a location
-parameter", 1964; for overlapping photographs: Brown and Lowe, "Automatic panoramic image stitching", 2007, section 4),
-so that all cameras agree on the colour of a point. The mean map is the identity, because no camera is known to be
-right. `SurfacePoints` and `best_agreement` are also used by the capture checks.
+The maps are fitted jointly by iteratively reweighted least squares (Huber, "Robust estimation of a
+location parameter", 1964; for overlapping photographs: Brown and Lowe, "Automatic panoramic image
+stitching", 2007, section 4), so that all cameras agree on the colour of a point. The mean map is
+the identity, because no camera is known to be right. `SurfacePoints` and `best_agreement` are also
+used by the capture checks.
 """
 
 from collections.abc import Collection
@@ -29,7 +30,8 @@ MIN_COSINE = 0.35
 MIN_MASK = 0.99
 """Points with a lower mask value are too close to the outline."""
 DEPTH_TOLERANCE = 0.01
-"""A point is occluded if it lies farther than this behind the proxy's depth, relative to the subject's size."""
+"""A point is occluded if it lies farther than this behind the proxy's depth, relative to the
+subject's size."""
 MIN_SHARED_POINTS = 80
 """Points that two cameras must share to be compared."""
 
@@ -50,8 +52,8 @@ FOLDS = 4
 MAX_RATIO = 0.9
 """Maps are used if they reduce the disagreement on held-out points to less than this share."""
 MAX_ODD = 2.0
-"""An odd camera keeps its map if its colours then disagree with the others' at most this many times as much as theirs
-among themselves."""
+"""An odd camera keeps its map if its colours then disagree with the others' at most this many times
+as much as theirs among themselves."""
 MIN_DISAGREEMENT = 0.012
 """A smaller disagreement is not corrected, as the error of the hull alone causes that much."""
 TINY = 1e-9
@@ -105,8 +107,9 @@ class SurfacePoints:
 def best_agreement(colours: SurfaceColours) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"]]:
     """How well each camera's colours agree with the other camera that they agree with best.
 
-    Returns the smallest RMS distance of RGB and the highest correlation, over the points that both cameras see; NaN if
-    no other camera shares enough points. A faulty camera disagrees with all others; a correct one does not.
+    Returns the smallest RMS distance of RGB and the highest correlation, over the points that both
+    cameras see; NaN if no other camera shares enough points. A faulty camera disagrees with all
+    others; a correct one does not.
     """
     shared = zip(colours.rgb, colours.seen[:, None] & colours.seen, strict=True)
     best = [agreement(own, both, colours, view) for view, (own, both) in enumerate(shared)]

@@ -26,7 +26,8 @@ TO_BT709 = {
     DCI_P3: ((1.2249, -0.2247, 0.0), (-0.0420, 1.0419, 0.0), (-0.0197, -0.0786, 1.0979)),
     DISPLAY_P3: ((1.2249, -0.2247, 0.0), (-0.0420, 1.0419, 0.0), (-0.0197, -0.0786, 1.0979)),
 }
-"""Linear RGB of BT.709, which are those of sRGB, from linear RGB of other primaries with the same white (D65)."""
+"""Linear RGB of BT.709, which are those of sRGB, from linear RGB of other primaries with the same
+white (D65)."""
 
 
 def is_srgb(primaries: int, transfer: int) -> bool:

@@ -35,13 +35,15 @@ OPAQUE_ALPHA = 128
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
 RUN_LENGTH_SUFFIX = ".bin"
-"""Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then the end of each run."""
+"""Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then
+the end of each run."""
 
 
 def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Read an image file as 8-bit RGB, exactly as stored: EXIF rotation is ignored, as calibrations ignore it.
 
-    All readers raise a CaptureError for a file that they cannot use, which `where` starts: file, camera, frame.
+    All readers raise a CaptureError for a file that they cannot use, which `where` starts: file,
+    camera, frame.
     """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     bgr = _decode(_read_file(path, where), where, flags)

@@ -21,11 +21,14 @@ class LabelMaskRule:
     max_labels: int = MAX_LABELS
     """Masks without an opaque pixel hold labels if they have at most this many values in all."""
     min_share: float = 0.005
-    """A single mask holds a label only if at least this share of its pixels has it, and at least this share is 0."""
+    """A single mask holds a label only if at least this share of its pixels has it, and at least
+    this share is 0."""
     min_one_level: float = 0.8
-    """A mask has one level if at least this share of its foreground is at that level; edges have other values."""
+    """A mask has one level if at least this share of its foreground is at that level; edges have
+    other values."""
     max_spread: float = 0.25
-    """A pixel of masks with many values is at their level if it differs from it by at most this share of the level."""
+    """A pixel of masks with many values is at their level if it differs from it by at most this
+    share of the level."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,9 @@ class LabelMasks:
     def convert(self, mask: Masks) -> ConvertedMasks | None:
         """The masks of a frame with labels as 255; None if they stay as they are.
 
-        As long as no mask was opaque, all masks hold labels if they have few values, and have a low opaque level if
-        nearly all of their foreground is at one level. Once a mask was opaque, each other mask is judged by itself: it
-        holds a label if it consists of 0 and one low value.
+        As long as no mask was opaque, all masks hold labels if they have few values, and have a low
+        opaque level if nearly all of their foreground is at one level. Once a mask was opaque, each
+        other mask is judged by itself: it holds a label if it consists of 0 and one low value.
         """
         highest = mask.flatten(1).amax(1).tolist()
         self._seen_opaque = self._seen_opaque or max(highest) >= self._rule.opaque

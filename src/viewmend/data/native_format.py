@@ -156,8 +156,8 @@ class NativeCalibration:
     folder: Path
     """The folder that the cameras' paths are relative to."""
     origin_m: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """The file's coordinates of this calibration's origin, which is near the cameras: 0 unless these are far from the
-    file's origin, as in survey coordinates."""
+    """The file's coordinates of this calibration's origin, which is near the cameras: 0 unless
+    these are far from the file's origin, as in survey coordinates."""
 
 
 def read_calibration(folder: Path) -> NativeCalibration:

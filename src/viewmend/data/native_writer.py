@@ -39,9 +39,10 @@ def write_capture(
 ) -> tuple[int, ...]:
     """Write all frames of a source to the folder `out`: images, masks and depth if present, and `cameras.json`.
 
-    With PNG, reading the folder returns the same frames bit for bit (depth to half a millimetre). JPEG (quality 95,
-    no chroma subsampling) is smaller; masks and depth are always PNG. The folder is complete or absent, see
-    `atomic_folder`. Returns the indices of frames with masks but without a subject.
+    With PNG, reading the folder returns the same frames bit for bit (depth to half a
+    millimetre). JPEG (quality 95, no chroma subsampling) is smaller; masks and depth are
+    always PNG. The folder is complete or absent, see `atomic_folder`. Returns the indices
+    of frames with masks but without a subject.
 
     Args:
         source: a capture, a studio, or any other object with their attributes and `read`.

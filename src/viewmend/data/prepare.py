@@ -1,8 +1,8 @@
 """Preparing a capture: check it, align it on its input cameras, match colours, limit the image size.
 
-`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`; `train` does not match colours, and
-`serve` limits the image size. Serious faults of a capture raise a `CaptureError`; others are logged once as warnings
-of the logger `viewmend`.
+`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`; `train` does not
+match colours, and `serve` limits the image size. Serious faults of a capture raise a
+`CaptureError`; others are logged once as warnings of the logger `viewmend`.
 """
 
 import logging
@@ -74,8 +74,9 @@ class PreparedCapture(CaptureWrapper):
     def adjust(self, frame: MultiViewFrame, label: str) -> MultiViewFrame:
         """A frame of the source, or of the same rig, with the calibration of `cameras`; `label` is for messages.
 
-        A camera whose mask is inverted or wrongly empty, or whose image is black, is left out of the frame and reported
-        once. CaptureError if half of the masks are inverted, or no camera is left.
+        A camera whose mask is inverted or wrongly empty, or whose image is black, is left
+        out of the frame and reported once. CaptureError if half of the masks are inverted,
+        or no camera is left.
         """
         frame = frame.without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
@@ -114,17 +115,19 @@ def prepare(
 
     Args:
         source: the capture.
-        inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
+        inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras
+            have no effect.
         max_image_size: images are reduced to at most this length of their longer side.
-        align: find the shift that all images share from the masks of one frame at full size, and look for out-of-sync
-            cameras in the frames around it: `first_with_subject`.
-        match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
-            of the surface that the correction was not fitted to.
+        align: find the shift that all images share from the masks of one frame at full size, and
+            look for out-of-sync cameras in the frames around it: `first_with_subject`.
+        match_colours: match the input cameras' colours in the same frame, if that improves their
+            agreement on parts of the surface that the correction was not fitted to.
         first: index of the first frame that will be used.
         last: index of the last frame that will be used, at which synchronisation is checked again.
 
     Raises:
-        CaptureError: a frame cannot be read, its masks or calibration are unusable, or no frame has a subject.
+        CaptureError: a frame cannot be read, its masks or calibration are unusable, or no
+            frame has a subject.
         ValueError: the input cameras look away from each other.
 
     Examples:
@@ -211,8 +214,9 @@ def first_with_subject(
 ) -> MultiViewFrame | None:
     """The input cameras in a frame in which `least` of them are present and see the subject; None without masks.
 
-    It is the first one from the index `first` on, or else the last one before. While a subject enters, a later frame is
-    taken, in which half of the cameras see it, or the most. CaptureError if no frame has foreground.
+    It is the first one from the index `first` on, or else the last one before. While a subject
+    enters, a later frame is taken, in which half of the cameras see it, or the most. CaptureError
+    if no frame has foreground.
     """
     count = len(source.frame_ids)
     has_subject = False

@@ -57,7 +57,8 @@ class CaptureSource(Protocol):
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` of `frame_ids`. Cameras without an image in this frame are absent.
 
-        CaptureError if all files are missing, or one is unreadable or has the wrong size; IndexError without that time.
+        CaptureError if all files are missing, or one is unreadable or has the wrong size;
+        IndexError without that time.
         """
         ...
 
@@ -158,8 +159,9 @@ class CaptureSubset(CaptureWrapper):
 def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Iterator[MultiViewFrame]:
     """Yield the frames at `times` (default: all) in order, while a thread reads the next ones.
 
-    Frames are read one at a time: folders already decode their cameras in parallel, and videos need frames in order.
-    An error is raised in the place of the frame that could not be read. Closing the iterator cancels pending reads.
+    Frames are read one at a time: folders already decode their cameras in parallel, and videos need
+    frames in order. An error is raised in the place of the frame that could not be read. Closing
+    the iterator cancels pending reads.
     """
     coming = iter(range(len(source.frame_ids)) if times is None else times)
     pending: deque[Future[MultiViewFrame]] = deque()
@@ -202,7 +204,8 @@ def scale_cameras(cameras: Cameras, *scales: float) -> Cameras:
 def resize_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
     """Resize images and masks (bilinear, antialiased) to `cameras`, which are the frame's own cameras resized.
 
-    Depth is dropped, because averaged depths are wrong at edges. If `cameras` is `frame.cameras`, returns the frame.
+    Depth is dropped, because averaged depths are wrong at edges. If `cameras` is `frame.cameras`,
+    returns the frame.
     """
     if cameras is frame.cameras:
         return frame

@@ -21,8 +21,9 @@ class Undistortion:
     def apply(self, images: CameraImages) -> CameraImages:
         """Undistort images to the pinhole camera with the same K and size; returns them if there is no distortion.
 
-        Pixels that lie outside the distorted image (corners, with pincushion distortion) repeat its border, so that
-        the mask of a subject cut off by the border continues and does not carve the hull. Depth there is 0, unknown.
+        Pixels that lie outside the distorted image (corners, with pincushion distortion) repeat its
+        border, so that the mask of a subject cut off by the border continues and does not carve the
+        hull. Depth there is 0, unknown.
         """
         camera = self._camera
         if not camera.dist.any():

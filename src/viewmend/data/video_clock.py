@@ -15,8 +15,8 @@ from viewmend.data.videos import video_properties
 ABSENT = -1
 """Stands for the frame of a film that has none at a time."""
 TOLERANCE, NEW_TIME = 0.5, 0.75
-"""In frame periods: a frame belongs to a time if it is at most the first from it, and adds a time of its own if it is
-farther than the second from all others."""
+"""In frame periods: a frame belongs to a time if it is at most the first from it, and adds a time
+of its own if it is farther than the second from all others."""
 GAP = 1.5
 """Frames are missing where the interval is this many periods."""
 SAME_PHASE = 0.5
@@ -101,7 +101,8 @@ class VideoClock:
     moved: frozenset[tuple[str, TrackKind]]
     """Films that had no time in common with the others, and were moved to start together with them."""
     by_index: frozenset[str]
-    """Cameras whose masks have other times, but as many frames as their images, and were matched one to one."""
+    """Cameras whose masks have other times, but as many frames as their images, and were matched
+    one to one."""
     timecodes: str | None = None
     """What the films' timecodes say of their starts, if these differ, and whether they were used."""
 
@@ -216,8 +217,9 @@ def _named(cameras: list[str]) -> str:
 def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     """Match films by time. A film of the rate that at least half of the cameras have sets the times.
 
-    Other films fill its gaps. Films of its rate that run with a constant distance of less than a frame are matched one
-    to one, and so are masks with as many frames as their images. ValueError if no two cameras share a time.
+    Other films fill its gaps. Films of its rate that run with a constant distance of less than a
+    frame are matched one to one, and so are masks with as many frames as their images. ValueError
+    if no two cameras share a time.
     """
     tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
     tracks, timecodes = _by_timecode(tracks)

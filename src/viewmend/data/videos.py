@@ -1,7 +1,8 @@
 """Video files: exact frames with their presentation times, and writing of MP4 and WebM.
 
-Captures and live rigs decode films here, so they see the same frames: upright, in the colours that the file declares,
-at the times that it gives. What a container claims of length and rate is not trusted.
+Captures and live rigs decode films here, so they see the same frames: upright, in the
+colours that the file declares, at the times that it gives. What a container claims of
+length and rate is not trusted.
 """
 
 import functools
@@ -96,7 +97,8 @@ SEEK_FRAMES = 8
 """Fewer frames than this are decoded rather than skipped by seeking."""
 RATE_TOLERANCE = 0.01
 NO_CHROMA_FILTER = "POINT"
-"""Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths follow this choice."""
+"""Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths
+follow this choice."""
 ALPHA_OPTIONS = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
 """Alpha is encoded as a second image. VP9's hidden reference frames would separate the two."""
 
@@ -123,13 +125,15 @@ class VideoProperties:
     times_s: tuple[float, ...]
     """Presentation time of each frame, increasing; 0 is the start of the recording."""
     timestamps: tuple[int, ...] | None
-    """The decoder's own times of the frames; None if they do not increase, so that frames are counted instead."""
+    """The decoder's own times of the frames; None if they do not increase, so that frames are
+    counted instead."""
     keys: tuple[int, ...]
     """The timestamps at which decoding can start."""
     is_timed: bool = True
     """Whether the file stores the times of its frames; raw streams do not."""
     is_interlaced: bool = False
-    """Whether frames are made of two fields. They are read de-interlaced, at the time of their first field."""
+    """Whether frames are made of two fields. They are read de-interlaced, at the time of their
+    first field."""
     timecode: str | None = None
     """The recorder's clock at the first frame, HH:MM:SS:FF, or HH:MM:SS;FF in drop-frame counting."""
 
@@ -414,9 +418,9 @@ class VideoFile:
 class VideoWriter:
     """Writes a film of frames that all have the size of the first. A context manager.
 
-    RGB becomes an H.264 MP4 that plays everywhere (4:2:0); an odd last row or column is dropped. RGB with `alpha`
-    becomes a VP9 WebM, which browsers and editors composite. `threads` is the number of encoder threads, 0 for one per
-    core.
+    RGB becomes an H.264 MP4 that plays everywhere (4:2:0); an odd last row or column is dropped.
+    RGB with `alpha` becomes a VP9 WebM, which browsers and editors composite. `threads` is the
+    number of encoder threads, 0 for one per core.
     """
 
     def __init__(self, file: Path | BytesIO, fps: float, threads: int = 0, alpha: bool = False):
@@ -468,7 +472,8 @@ class VideoWriter:
 def tag_colours(context: "VideoCodecContext") -> None:
     """Declare that the YUV data are sRGB converted by BT.601 in video range, as FFmpeg does. Call before opening.
 
-    Without these tags browsers assume BT.709, always or from 720 rows on, and colours change by up to 25 of 255.
+    Without these tags browsers assume BT.709, always or from 720 rows on, and colours
+    change by up to 25 of 255.
     """
     context.colorspace = SMPTE170M
     context.color_range = VIDEO_RANGE

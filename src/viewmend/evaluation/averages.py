@@ -1,7 +1,7 @@
 """From the scores of frames to the tables of a report.
 
-Scores are averaged over the frames of a scene first: a `Record` is one metric of one method on one scene. Tables and
-files are queries of records.
+Scores are averaged over the frames of a scene first: a `Record` is one metric of one method on one
+scene. Tables and files are queries of records.
 """
 
 import statistics

@@ -1,8 +1,9 @@
 """The paper's three tables: its own figures next to those measured here.
 
-Its data, image size and GPU differ from ours: its figures have columns of their own, and nothing is computed from both.
-Tables 1 and 3 are on DNA-Rendering, table 2 on RIFTCast's captures without retraining. FPS are on a GPU that the paper
-does not name. Framings: def, at 432 x 240; win, windows; mul, windows with the frames of other cameras.
+Its data, image size and GPU differ from ours: its figures have columns of their own, and nothing is
+computed from both. Tables 1 and 3 are on DNA-Rendering, table 2 on RIFTCast's captures without
+retraining. FPS are on a GPU that the paper does not name. Framings: def, at 432 x 240; win,
+windows; mul, windows with the frames of other cameras.
 """
 
 import csv
@@ -21,7 +22,8 @@ from viewmend.models.registry import METHODS, make_method
 OURS = "ours"
 """Method of the paper's own row: stands for a model that is named at run time."""
 PAPER_COLUMNS = ("psnr", "ssim", "lpips", "vfid", "psnr_holes", "ssim_holes", "lpips_holes", "fps")
-"""`psnr_holes` is over the pixels of E by the paper's text; its values follow reading (b), that of masked images."""
+"""`psnr_holes` is over the pixels of E by the paper's text; its values follow reading (b), that of
+masked images."""
 PAPER_HEADINGS = {
     "psnr_holes": "PSNR inpainted, reading (b)",
     "ssim_holes": "SSIM inpainted",
@@ -127,8 +129,8 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
     Args:
         rows: of `paper_rows`, and rows without figures of the paper.
         report: the evaluation.
-        methods: for each row's `method`, the evaluated methods whose mean it shows (models of several seeds); a row
-            without one, or without cells, is n/a.
+        methods: for each row's `method`, the evaluated methods whose mean it shows (models of
+            several seeds); a row without one, or without cells, is n/a.
     """
     of = {row.method: row for row in report.tables[0].rows} if report.tables else {}
     heads = ("row", "here", *(f"{c[0]} (here)" for c in COLUMNS))

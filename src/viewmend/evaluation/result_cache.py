@@ -27,7 +27,8 @@ from viewmend.utils.contact_sheet import Picture
 from viewmend.utils.untrusted_input import typed
 
 PROTOCOL = 6
-"""Increased whenever synthetic scenes, renderer or scores change, so that old cells are not mixed with new ones."""
+"""Increased whenever synthetic scenes, renderer or scores change, so that old cells are not mixed
+with new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
 DAMAGED += (
     RuntimeError,

@@ -59,7 +59,8 @@ def run_evaluation(
         ray: address of a Ray cluster that does the work instead.
 
     Raises:
-        ValueError: a method cannot be made, two scenes have one name, `jobs` is not positive, or there is no cluster.
+        ValueError: a method cannot be made, two scenes have one name, `jobs` is not positive, or
+            there is no cluster.
     """
     settings = settings or RunSettings()
     _check([scene.name for scene in scenes], jobs)
@@ -127,7 +128,8 @@ def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) 
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
     except BrokenProcessPool:
-        # A process died (out of memory, say) and broke the pool. Run the rest one by one: only the culprit fails.
+        # A process died (out of memory, say) and broke the pool. Run the rest one by one: only the
+        # culprit fails.
         for task in left:
             yield task, _run_alone(task, settings, threads)
 

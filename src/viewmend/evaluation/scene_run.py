@@ -75,7 +75,8 @@ class SceneRun:
     scene: str
     runs: tuple[MethodRun, ...]
     images: tuple[Picture, Picture, Picture] | None = None
-    """Rendered view, E and truth of the frame with the largest hole; None if the scene could not be rendered."""
+    """Rendered view, E and truth of the frame with the largest hole; None if the scene
+    could not be rendered."""
     features: Features | None = None
     """Features of the true videos."""
 
@@ -103,9 +104,10 @@ def evaluate_scene(
 ) -> SceneRun:
     """Stream the held-out camera's view through the methods, one frame at a time, using past frames only.
 
-    The result depends on the arguments only, and everything can be pickled: processes and clusters call it. An
-    exception becomes the `error` of the method that raised it, or of all methods if the scene cannot be read.
-    Methods in `loaded`, which have run in this process, are neither loaded nor warmed up again; others are added.
+    The result depends on the arguments only, and everything can be pickled: processes and clusters
+    call it. An exception becomes the `error` of the method that raised it, or of all methods if the
+    scene cannot be read. Methods in `loaded`, which have run in this process, are neither loaded
+    nor warmed up again; others are added.
     """
     loaded = {} if loaded is None else loaded
     scorers = load_scorers(settings.background, settings.ssim, settings.networks, settings.device)

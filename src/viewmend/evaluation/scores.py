@@ -24,7 +24,8 @@ MIN_HOLE_PX = 50
 STILL = 0.02
 """A pixel of the truth counts as still if no channel changes by more, in [0, 1]."""
 CLIP_FRAMES = 16
-"""Length of the videos of VFID. The rest of a stream is a video, too, if it is half as long or the only one."""
+"""Length of the videos of VFID. The rest of a stream is a video, too, if it is half as long
+or the only one."""
 FEATURES = 1024
 """Length of I3D's feature vectors."""
 KINDS = tuple(f"{kind}_{mode}" for mode in MODES for kind in ("whole", "masked"))
@@ -86,10 +87,10 @@ def available_networks() -> tuple[tuple[str, ...], dict[str, str]]:
 class ViewScores:
     """Scores of one view: PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
 
-    PSNR, SSIM and LPIPS have four readings: `whole`, over all pixels; `holes`, over the holes only (a); `holes_fg`,
-    over the holes inside the true mask; `masked`, over all pixels of images blackened outside the holes (b). SSIM and
-    LPIPS over some pixels are means of the maps of the unmasked images. The holes are `IncompleteView.holes`, whatever
-    the error rule.
+    PSNR, SSIM and LPIPS have four readings: `whole`, over all pixels; `holes`, over the holes only
+    (a); `holes_fg`, over the holes inside the true mask; `masked`, over all pixels of images
+    blackened outside the holes (b). SSIM and LPIPS over some pixels are means of the maps of the
+    unmasked images. The holes are `IncompleteView.holes`, whatever the error rule.
     """
 
     time: int
@@ -143,9 +144,11 @@ class ViewScores:
     hull_iou: float | None = None
     """IoU of the true mask and the proxy."""
     flicker: float | None = None
-    """Change of the error since the previous frame along the surface's true motion, over the holes; 0 for the truth."""
+    """Change of the error since the previous frame along the surface's true motion, over the holes;
+    0 for the truth."""
     flicker_whole: float | None = None
-    """The same over the subject and the proxy; compare with the method `unfilled`, which shows the rendered view."""
+    """The same over the subject and the proxy; compare with the method `unfilled`, which shows the
+    rendered view."""
     change_still: float | None = None
     """Change since the previous frame where the truth is still (`STILL`); needs no true motion."""
 
@@ -251,7 +254,8 @@ def _by_origin(
 def mean_over_frames(values: Sequence[float | None], pixels: Sequence[int] | None = None) -> float | None:
     """Mean of the frames that have a value; None if none has.
 
-    With `pixels`, the number of pixels behind each value, frames with fewer than `MIN_HOLE_PX` count only if all are.
+    With `pixels`, the number of pixels behind each value, frames with fewer than `MIN_HOLE_PX`
+    count only if all are.
     """
     there = [(v, n) for v, n in zip(values, pixels or [0] * len(values), strict=True) if v is not None]
     enough = [v for v, n in there if n >= MIN_HOLE_PX] or [v for v, _ in there]

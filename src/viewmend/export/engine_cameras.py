@@ -8,7 +8,8 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.orbit import horizontal_axes
 
 SENSOR_MM = 36.0
-"""The sensor width of every camera in millimetres: engines need one, but only its ratio to the focal length matters."""
+"""The sensor width of every camera in millimetres: engines need one, but only its ratio to the
+focal length matters."""
 
 
 def engine_from_world(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -38,8 +38,8 @@ def write_glb(
         path: the file.
         vertices: metres, y up.
         faces: counter-clockwise from outside.
-        colours: sRGB in [0, 1]. They are written as linear 16-bit vertex colours, on an unlit material: they include
-            the captured light.
+        colours: sRGB in [0, 1]. They are written as linear 16-bit vertex colours, on an unlit
+            material: they include the captured light.
         normals: unit, outward.
 
     Raises:

@@ -23,7 +23,8 @@ SMALLEST_PX = 64
 MAX_CAMERAS = 64
 """A rig has at most this many cameras."""
 EXAMPLE = {"height": 70, "width": 66, "rows": 67, "columns": 73, "chosen": 3, "camera": 5}
-"""Sizes of the tensors that the model is traced with: all different, so that none is traced as equal to another."""
+"""Sizes of the tensors that the model is traced with: all different, so that none is traced as
+equal to another."""
 OPSET = 18
 """The version of ONNX's operators."""
 DTYPES = {"Float": torch.float32, "Int": torch.int64, "UInt8": torch.uint8, "Bool": torch.bool}
@@ -34,9 +35,9 @@ INDUCTOR_OPTIONS = {
     "cpp.dynamic_threads": True,
     "cpp.simdlen": 1,
 }
-"""AOTInductor's options. Constant folding needs known sizes. With layout optimisation, convolutions of a batch of
-unknown size give wrong results (torch 2.13). The caller sets the number of threads. Vectorised kernels compile for
-minutes and gain little."""
+"""AOTInductor's options. Constant folding needs known sizes. With layout optimisation, convolutions
+of a batch of unknown size give wrong results (torch 2.13). The caller sets the number of threads.
+Vectorised kernels compile for minutes and gain little."""
 
 
 def sizes(net: ViewSynthNet) -> dict[str, tuple[int, int]]:

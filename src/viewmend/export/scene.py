@@ -118,8 +118,8 @@ def extract_points(
 ) -> Float[Tensor, "point 6"]:
     """World positions, metres, and RGB in [0, 1] of pixels that show the subject, on the CPU.
 
-    Such a pixel has depth, an opacity above a half and at least this confidence; at least two cameras have its point in
-    view, and in none of these it is outside the mask.
+    Such a pixel has depth, an opacity above a half and at least this confidence; at least two
+    cameras have its point in view, and in none of these it is outside the mask.
     """
     depth = completed.surface_depth
     kept = (depth > 0) & (completed.opacity > 0.5)

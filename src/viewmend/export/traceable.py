@@ -1,9 +1,10 @@
 """The default model as one module from tensors to tensors that `torch.export` traces for any sizes.
 
-Layers and ray sampler are the model's own. Only image pyramids and a smooth fill are rewritten here, with operations
-that do not depend on sizes or contents. Each scale of an image lies in a canvas with at least one spare row and column,
-since a length of one would be traced as fixed. From some level on all canvases are as large as those of the largest
-image: expressions of many nested halves would take the compiler long.
+Layers and ray sampler are the model's own. Only image pyramids and a smooth fill are rewritten
+here, with operations that do not depend on sizes or contents. Each scale of an image lies in a
+canvas with at least one spare row and column, since a length of one would be traced as fixed. From
+some level on all canvases are as large as those of the largest image: expressions of many nested
+halves would take the compiler long.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +40,8 @@ LEVELS = 11
 CONSTANT = 5
 """From this level on, the canvases of an image pyramid have the same size for all images: 130 pixels."""
 SPARE = 16
-"""The sheet of `_packed` has this many rows more than the finest level, for the borders of the levels next to it."""
+"""The sheet of `_packed` has this many rows more than the finest level, for the borders of the
+levels next to it."""
 FILL_LEVELS = 12
 """The smooth fill halves a view this many times, until one pixel is left."""
 FILL_CONSTANT = 3
@@ -75,7 +77,8 @@ class ViewInputs(NamedTuple):
     masks: UInt8[Tensor, "camera rows columns"]
     """Foreground masks of all cameras, 0 to 255."""
     proxy_depths: Float[Tensor, "camera rows columns"]
-    """z-depth of the proxy in all cameras, metres, 0 where there is none; of cameras that are not chosen, anything."""
+    """z-depth of the proxy in all cameras, metres, 0 where there is none; of cameras that are not
+    chosen, anything."""
     rig_K: Float[Tensor, "camera 3 3"]  # noqa: N815
     """The cameras' intrinsics, pixels."""
     rig_camera_from_world: Float[Tensor, "camera 4 4"]
@@ -257,7 +260,8 @@ class PackedPyramids(NamedTuple):
 def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """All levels as one row of pixels, channels last; the index of each level's first pixel, its row length and size.
 
-    The finest level and, below each other to its right, those before `CONSTANT` make one sheet; the others follow.
+    The finest level and, below each other to its right, those before `CONSTANT` make one sheet; the
+    others follow.
     """
     finest = levels[0]
     right = levels[1:CONSTANT]

@@ -75,8 +75,9 @@ def count_tiles(image, rows, columns, tile, sums):
 def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
     """Classify a ball in one camera: not in view, all background, all foreground, or mixed.
 
-    The ball's image lies within radius |p1 - u p3| / (depth - radius) of its centre's u, likewise v, where p1 and p3
-    are rows of P; with `lens` = (fx^2 + skew^2, cx, fy^2, cy), |p1 - u p3|^2 = fx^2 + skew^2 + (cx - u)^2.
+    The ball's image lies within radius |p1 - u p3| / (depth - radius) of its centre's u, likewise
+    v, where p1 and p3 are rows of P; with `lens` = (fx^2 + skew^2, cx, fy^2, cy), |p1 - u p3|^2 =
+    fx^2 + skew^2 + (cx - u)^2.
     """
     depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     if depth + radius <= NEAR_M:

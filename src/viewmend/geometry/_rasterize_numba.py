@@ -23,9 +23,9 @@ def project_vertices(vertices, P, out):
 def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, triangle):
     """Draw all faces into rows [first_row, end_row) of one view's `depth` (as z) and `triangle`.
 
-    Homogeneous edge functions (Olano and Greer 1997): with q = P X of a corner, edge i is (q_j x q_k) . (u, v, 1).
-    They need no clipping, and two triangles compute exactly opposite values along the edge that they share.
-    `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
+    Homogeneous edge functions (Olano and Greer 1997): with q = P X of a corner, edge i is (q_j x
+    q_k) . (u, v, 1). They need no clipping, and two triangles compute exactly opposite values along
+    the edge that they share. `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
     """
     for f in range(faces.shape[0]):
         a = projected[faces[f, 0]]

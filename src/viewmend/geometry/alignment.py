@@ -1,8 +1,8 @@
 """A shift that all images of a rig have against its calibration, found from the masks alone.
 
-Wrong conventions for pixel centres, crops and chroma subsampling shift every image of a rig by the same fraction of a
-pixel. Then no point of space agrees with all outlines, and the visual hull comes out thinner than the masks. The shift
-that makes hull and masks agree best undoes it.
+Wrong conventions for pixel centres, crops and chroma subsampling shift every image of a rig by the
+same fraction of a pixel. Then no point of space agrees with all outlines, and the visual hull comes
+out thinner than the masks. The shift that makes hull and masks agree best undoes it.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,8 @@ LARGEST_PX = 1.5
 MARGIN = 0.05
 """The box in which shifted hulls are carved is larger than the first hull by this fraction, to each side."""
 WORTH_MOVING = 0.003
-"""A shift counts if the IoU of hull and masks rises by this much, which is above the noise of exact calibrations."""
+"""A shift counts if the IoU of hull and masks rises by this much, which is above the noise of exact
+calibrations."""
 LEAST_IOU = 0.8
 """No shift is applied if the IoU stays below this, because a mask or a camera is wrong then."""
 
@@ -48,8 +49,9 @@ def shared_offset(
 ) -> Alignment:
     """The common shift of the images against the calibration, from one time's masks.
 
-    A few hulls and their silhouettes are computed, so this is for the start of a capture, not for every frame. Shifts
-    that a rig cannot tell from a move of the subject (all cameras level: up and down) stay near zero.
+    A few hulls and their silhouettes are computed, so this is for the start of a capture, not for
+    every frame. Shifts that a rig cannot tell from a move of the subject (all cameras level: up and
+    down) stay near zero.
 
     Raises:
         ValueError: there is one camera only, or the cameras look away from each other.

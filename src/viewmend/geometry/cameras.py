@@ -13,16 +13,16 @@ from viewmend.geometry.rigid import invert_rigid
 from viewmend.utils.tensors import OnDevice, check_tensor
 
 FARTHEST = 2e4
-"""Largest distance of cameras from the origin, relative to the extent of their rig; at that distance, 32-bit positions
-are exact to a thousandth of the extent."""
+"""Largest distance of cameras from the origin, relative to the extent of their rig; at that
+distance, 32-bit positions are exact to a thousandth of the extent."""
 
 
 @dataclass(frozen=True)
 class Cameras(OnDevice):
     """Calibrated pinhole cameras (with skew, without distortion: captures are undistorted when read).
 
-    Axes are OpenCV's: x right, y down, z forward. K is in pixels of an image whose top-left pixel has its centre
-    at (0.5, 0.5). Lengths are metres. One camera is a `Cameras` of one view.
+    Axes are OpenCV's: x right, y down, z forward. K is in pixels of an image whose top-left pixel
+    has its centre at (0.5, 0.5). Lengths are metres. One camera is a `Cameras` of one view.
 
     Examples:
         >>> import torch

@@ -1,8 +1,8 @@
 """The visual hull, tightened by depth maps that a model predicted.
 
-A hull cannot be concave, and with few cameras it is too large. Depth maps are fused as in Curless and Levoy (SIGGRAPH
-1996): every voxel takes the weighted mean of its signed distances to the surfaces that the views see. What no view says
-anything about stays as the hull has it.
+A hull cannot be concave, and with few cameras it is too large. Depth maps are fused as in Curless
+and Levoy (SIGGRAPH 1996): every voxel takes the weighted mean of its signed distances to the
+surfaces that the views see. What no view says anything about stays as the hull has it.
 """
 
 from dataclasses import dataclass
@@ -42,14 +42,16 @@ class FusionConfig:
     resolution: int = 160
     """Voxels along the longest side of the subject's box."""
     max_views: int = 24
-    """Largest number of views whose depth is predicted: first cameras of the rig, then virtual ones in its gaps."""
+    """Largest number of views whose depth is predicted: first cameras of the rig, then virtual ones
+    in its gaps."""
     min_angle_deg: float = 8.0
     """Smallest angle between two of these views, as seen from the subject, in degrees."""
     view_px: int = 240
     """Pixels that the longest side of the subject's box spans in the views whose depth is predicted."""
     truncation_voxels: float = 3.0
-    """Distance in front of a surface, in voxels, from which a voxel counts as empty, whatever its distance. Voxels that
-    are farther than this behind the surface that a view sees are hidden from it."""
+    """Distance in front of a surface, in voxels, from which a voxel counts as empty,
+    whatever its distance. Voxels that are farther than this behind the surface that a view
+    sees are hidden from it."""
     confidence_power: float = 1.0
     """Exponent of the confidence in a depth's weight."""
 
@@ -95,8 +97,9 @@ def fuse_depth(
 def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> OccupancyGrid:
     """Occupancy after fusion: 1 inside, 0 outside, one half on the surface, and never above the hull's.
 
-    Each view that sees a voxel adds its signed distance to the surface along the axis of its camera, truncated in front
-    and weighted by the confidence. Behind the truncation, the view says nothing.
+    Each view that sees a voxel adds its signed distance to the surface along the axis of
+    its camera, truncated in front and weighted by the confidence. Behind the truncation,
+    the view says nothing.
     """
     fuse = _fuse_numba if hull.values.device.type == "cpu" else _fuse_torch
     return OccupancyGrid(fuse(hull, views, config), hull.low, hull.voxel_m)

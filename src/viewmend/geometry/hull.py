@@ -26,8 +26,8 @@ TILES = 32
 BLOCK = 4
 """The kernels judge blocks of this many voxels, and tiles of this many pooled pixels, whole."""
 PART_BLOCK = 2
-"""The blocks by which a hull's parts are labelled have this many voxels along each side; parts less than a block
-apart count as one."""
+"""The blocks by which a hull's parts are labelled have this many voxels along each side; parts less
+than a block apart count as one."""
 ISO = 0.5
 """A voxel is inside if its occupancy is at least this; the surface is where it is this."""
 FAINT = 0.1
@@ -35,7 +35,8 @@ FAINT = 0.1
 NEAR_M = 1e-6
 """A camera does not see what is nearer than this, in metres."""
 SAMPLES = 1 << 24
-"""Cameras are carved together on a device as long as their voxels are no more than this, which bounds the memory."""
+"""Cameras are carved together on a device as long as their voxels are no more than this, which
+bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,15 +56,17 @@ class HullConfig:
     coarse_passes: int = 3
     """Passes of that search; with 0, carving begins with the whole bounds."""
     pixels_per_voxel: float = 2.0
-    """Masks are pooled until a voxel spans about this many pixels, then smoothed, to avoid staircase artefacts."""
+    """Masks are pooled until a voxel spans about this many pixels, then smoothed, to avoid
+    staircase artefacts."""
     min_views: int = 2
     """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
-    """Points seen by a smaller share of the cameras count as empty. If fewer cameras than that see the whole subject,
-    because the image border of the others cuts it off, it is enough that as many as these see a point."""
+    """Points seen by a smaller share of the cameras count as empty. If fewer cameras than that see
+    the whole subject, because the image border of the others cuts it off, it is enough that as many
+    as these see a point."""
     least_fraction: float = 0.25
-    """Points seen by a smaller share of the cameras count as empty, however many are cut off, if `min_fraction` is not
-    lower."""
+    """Points seen by a smaller share of the cameras count as empty, however many are cut off, if
+    `min_fraction` is not lower."""
 
 
 Box = tuple[slice, slice, slice]
@@ -139,8 +142,9 @@ def visual_hull(
 ) -> OccupancyGrid:
     """Occupancy of `bounds`: the smallest (softened) mask value over the cameras that see a point.
 
-    Points outside a camera's image or behind it are not constrained by it; space that too few cameras see is empty. The
-    minimum, unlike RIFTCast's product, does not thin the subject as cameras are added.
+    Points outside a camera's image or behind it are not constrained by it; space that too few
+    cameras see is empty. The minimum, unlike RIFTCast's product, does not thin the subject as
+    cameras are added.
 
     Raises:
         ValueError: there is one camera only.
@@ -314,7 +318,8 @@ def check_views(cameras: Cameras) -> None:
 def bounds_from_cameras(cameras: Cameras) -> Bounds:
     """A cube that holds what all cameras look at, for rigs of any size and shape.
 
-    Its centre is the point nearest to all optical axes; it is as large as the median camera sees at that distance.
+    Its centre is the point nearest to all optical axes; it is as large as the median camera sees at
+    that distance.
 
     Raises:
         ValueError: the cameras look away from each other.

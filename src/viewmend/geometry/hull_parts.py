@@ -13,14 +13,14 @@ from viewmend.geometry.hull import ISO, PART_BLOCK, OccupancyGrid
 from viewmend.geometry.sampling import in_view
 
 CELL = 1.25
-"""Images are compared in square cells, whose side is this many times the nearest voxel's image, so that no cell inside
-a part is missed."""
+"""Images are compared in square cells, whose side is this many times the nearest voxel's image, so
+that no cell inside a part is missed."""
 COVERED = 0.75
-"""A part is not needed if the others cover this fraction of its image in every camera. Masks of real cameras disagree
-by strips at the outline, which a part can cover by chance."""
+"""A part is not needed if the others cover this fraction of its image in every camera. Masks of
+real cameras disagree by strips at the outline, which a part can cover by chance."""
 SPECK = 4
-"""A part is not needed either if it covers at most this many cells of each image on its own, such as a speck next to a
-hand. The largest part stays unless the others cover it."""
+"""A part is not needed either if it covers at most this many cells of each image on its own, such
+as a speck next to a hand. The largest part stays unless the others cover it."""
 MANY = 2000
 """Distinct numbers are found by marking them if there are at least this many, else by sorting."""
 
@@ -28,7 +28,8 @@ MANY = 2000
 def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGrid:
     """The hull without specks and without parts whose image others mostly cover in every camera, the smallest first.
 
-    What a camera sees on its own, such as a second person or a ball in the air, stays unless it is a few voxels small.
+    What a camera sees on its own, such as a second person or a ball in the air, stays unless it is
+    a few voxels small.
     """
     from scipy.ndimage import label
 
@@ -86,8 +87,8 @@ def _unneeded(
 ) -> list[int]:
     """The parts that can go, one after another, while nearly all of every image stays covered.
 
-    What lies next to a covered cell counts as covered: a part that nothing demands has edges where others have theirs,
-    as the same masks have carved both.
+    What lies next to a covered cell counts as covered: a part that nothing demands has edges where
+    others have theirs, as the same masks have carved both.
     """
     sizes = np.bincount(part)
     uv, z = project(points, cameras)

@@ -48,7 +48,8 @@ class LineSamples:
     in_camera: Float64[np.ndarray, "point place view 3"]
     """In each camera's frame."""
     outside_px: Float64[np.ndarray, "point place view"]
-    """How far outside of each mask; 0 inside, where a camera does not see it, and in the line's own camera."""
+    """How far outside of each mask; 0 inside, where a camera does not see it, and in the
+    line's own camera."""
     slope: Float64[np.ndarray, "point place view 2"]
     """How that grows to the right and downwards."""
 
@@ -185,7 +186,8 @@ def _interpolate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bilinear values at pixel positions (beyond the border the nearest of it), and their slopes in x and y.
 
-    `flat` has the pixels of all images; the image of a position begins at `first`, and `size` is its width and height.
+    `flat` has the pixels of all images; the image of a position begins at `first`, and `size` is
+    its width and height.
     """
     width, height = size
     x = np.clip(uv_px[..., 0] - 0.5, 0, width - 1.001)

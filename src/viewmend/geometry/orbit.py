@@ -23,15 +23,15 @@ FITTED_FRAMES = 24
 FITTED_RESOLUTION = 64
 """Their hulls have this many voxels along the longest side."""
 FULL_TURN_GAP_RAD = math.radians(130)
-"""A rig with a larger gap between neighbouring cameras does not surround the subject, so its orbit swings back and
-forth."""
+"""A rig with a larger gap between neighbouring cameras does not surround the subject, so its orbit
+swings back and forth."""
 
 
 def upright(cameras: Cameras) -> Float[Tensor, "3"]:
     """The rig's up, a unit vector in the world.
 
-    The mean of the images' up directions or, where these disagree (images partly upside down), the normal of the
-    plane that the cameras lie in.
+    The mean of the images' up directions or, where these disagree (images partly upside down), the
+    normal of the plane that the cameras lie in.
     """
     mean = -cameras.camera_from_world[:, 1, :3].mean(0)
     if float(mean.norm()) < AGREED:
@@ -96,8 +96,8 @@ def orbit_around(
 ) -> Cameras:
     """Novel cameras on a circle about `center`, as far and as high as the rig's cameras on average.
 
-    A rig all around is circled once every `frames_per_turn` views; for a rig on one side the path swings from its one
-    end to the other and back. Images show as much as the first camera's.
+    A rig all around is circled once every `frames_per_turn` views; for a rig on one side the path
+    swings from its one end to the other and back. Images show as much as the first camera's.
 
     Args:
         center: the subject's middle, metres.

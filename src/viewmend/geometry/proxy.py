@@ -64,9 +64,9 @@ def reconstruct(
 ) -> GeometryProxy:
     """The visual hull's surface from the masks of all cameras, without floating parts that no mask needs.
 
-    A search over `bounds` (estimated from the masks where None) finds the box that the subject fills; all voxels are
-    spent there. So bounds much larger than the subject cost no detail. Where the masks agree on no
-    point of space, or are empty, the proxy is empty.
+    A search over `bounds` (estimated from the masks where None) finds the box that the subject
+    fills; all voxels are spent there. So bounds much larger than the subject cost no detail. Where
+    the masks agree on no point of space, or are empty, the proxy is empty.
 
     Raises:
         ValueError: there is one camera only, or the cameras look away from each other.

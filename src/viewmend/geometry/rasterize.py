@@ -36,8 +36,9 @@ class Raster:
 def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front"] = "none") -> Raster:
     """Draw `mesh` into every camera, images of `cameras.max_size_px`; nothing is drawn beyond a view's own size.
 
-    A pixel is covered if its centre is in a triangle (edges included: no cracks); the nearest surface wins, and of
-    equally near ones the lower index. What is behind a camera draws nothing. Depth is perspective-correct.
+    A pixel is covered if its centre is in a triangle (edges included: no cracks); the nearest
+    surface wins, and of equally near ones the lower index. What is behind a camera draws nothing.
+    Depth is perspective-correct.
 
     Args:
         mesh: triangles in the world; numba draws them on the CPU, torch elsewhere.
@@ -146,7 +147,8 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     low, high = _pixel_boxes(corners, cameras.size_px)
     keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
 
-    # every triangle of every view has a box of pixels, of which the device tells only the total number at first
+    # every triangle of every view has a box of pixels, of which the device tells only the total
+    # number at first
     view = torch.arange(len(cameras), device=device).repeat_interleave(
         len(mesh.faces), output_size=keep.numel()
     )
@@ -176,7 +178,8 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
 def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
     """Boxes whose pixels are drawn at once, at most about `CANDIDATES`, and how many pixels they have.
 
-    `ends` counts the pixels up to the end of each box. One portion, if that is enough, waits for the device only once.
+    `ends` counts the pixels up to the end of each box. One portion, if that is enough, waits for
+    the device only once.
     """
     total = int(ends[-1]) if len(ends) else 0
     if total <= CANDIDATES:

@@ -20,8 +20,8 @@ Loop = list[int]
 def extract_surface(grid: OccupancyGrid) -> Mesh:
     """The surface where the grid's value is one half, linearly interpolated: closed, outward, on the grid's device.
 
-    Space beyond the grid counts as empty, so an object that leaves it is capped. Each side of a triangle belongs to
-    exactly two triangles. An empty grid gives a mesh of no vertices.
+    Space beyond the grid counts as empty, so an object that leaves it is capped. Each side of a
+    triangle belongs to exactly two triangles. An empty grid gives a mesh of no vertices.
     """
     device = grid.values.device
     sides = grid.summary.inside
@@ -114,9 +114,10 @@ def _march_tables(device: torch.device) -> tuple[Int[Tensor, "256 5 3"], Int[Ten
 def triangle_table() -> Int[Tensor, "256 5 3"]:
     """For each case up to five triangles, as edges whose crossings are their corners; -1 where there are fewer.
 
-    The surface cuts each face of a cell by a rule that looks at that face alone (inside corners that touch only
-    diagonally stay apart), and no triangle has another side in a face. So neighbours always fit, and a surface of a
-    volume whose border is outside is closed: each side belongs to exactly two triangles.
+    The surface cuts each face of a cell by a rule that looks at that face alone (inside corners
+    that touch only diagonally stay apart), and no triangle has another side in a face. So
+    neighbours always fit, and a surface of a volume whose border is outside is closed: each side
+    belongs to exactly two triangles.
     """
     table = torch.full((256, 5, 3), -1, dtype=torch.long)
     for case in range(256):

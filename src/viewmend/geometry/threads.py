@@ -14,9 +14,9 @@ import torch
 def parallel_for(work: Callable[[int], object], count: int) -> None:
     """Call `work(0)` to `work(count - 1)` on as many threads as torch may use; `work` must release the GIL to gain.
 
-    Uses plain threads instead of numba's, which abort the process when two callers run at once and do not survive a
-    fork. The calling thread takes part and does not wait for the others to start; the pool is reused, because starting
-    threads costs a millisecond on busy cores.
+    Uses plain threads instead of numba's, which abort the process when two callers run at once and
+    do not survive a fork. The calling thread takes part and does not wait for the others to start;
+    the pool is reused, because starting threads costs a millisecond on busy cores.
     """
     items = itertools.count()
 
@@ -41,7 +41,8 @@ _torch = threading.local()
 def light_operations() -> Iterator[None]:
     """Run torch operations on the calling thread only, except in `heavy_operations`; `parallel_for` is unaffected.
 
-    Operations on the pixels of one view take less time than waking another thread. Context manager and decorator.
+    Operations on the pixels of one view take less time than waking another thread. Context manager
+    and decorator.
     """
     with _torch_threads(1):
         yield

@@ -19,10 +19,12 @@ STEPS = (1 / 3, 1 / 2, 2 / 3)
 """The parts of the way from a camera to its neighbour at which a virtual camera may stand."""
 
 WIDEST_GAP_RAD = math.radians(130)
-"""Two cameras that are farther apart than this, seen from the subject, have no virtual camera between them."""
+"""Two cameras that are farther apart than this, seen from the subject, have no virtual camera
+between them."""
 
 STEEP = 0.98
-"""A view whose direction has a cosine above this with the rig's up keeps the up direction of its camera's image."""
+"""A view whose direction has a cosine above this with the rig's up keeps the up direction of its
+camera's image."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,9 @@ class _Candidates:
 def surround(cameras: Cameras, center: Float[Tensor, "3"], most: int, min_angle_rad: float) -> Cameras:
     """Views all around the subject: cameras of the rig, and virtual cameras in the gaps between neighbours.
 
-    Views are chosen one after the other, each as far as possible from those chosen before it; all real cameras come
-    first. A virtual camera looks at the centre, with the intrinsics and the image size of the closest real camera.
+    Views are chosen one after the other, each as far as possible from those chosen before it; all
+    real cameras come first. A virtual camera looks at the centre, with the intrinsics and the image
+    size of the closest real camera.
 
     Args:
         cameras: the rig.

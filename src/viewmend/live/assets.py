@@ -1,14 +1,15 @@
 """What a page needs to draw the views of a frame by itself, made once per frame for all viewers.
 
-The shape: vertices, faces and vertex colours of the geometry proxy, with the cameras and the blending rule. Positions
-are 16 bits a coordinate within the proxy's box: a thousandth of a pixel for a subject that fills a view of any size
-allowed, at half the bytes of floats. All arrays are stored as differences and deflated: browsers inflate by
-themselves, so the page needs no decoder, and a mesh codec would save less than a tenth of a frame's bytes, most of
-which are images.
+The shape: vertices, faces and vertex colours of the geometry proxy, with the cameras and the
+blending rule. Positions are 16 bits a coordinate within the proxy's box: a thousandth of a pixel
+for a subject that fills a view of any size allowed, at half the bytes of floats. All arrays are
+stored as differences and deflated: browsers inflate by themselves, so the page needs no decoder,
+and a mesh codec would save less than a tenth of a frame's bytes, most of which are images.
 
-The images: the part of each camera's image that shows the subject, as JPEG with colour at full resolution, followed by
-its mask, deflated. WebP halves the colour's resolution, and takes 15 times as long, which rules out live rigs. On 20
-cameras of wd2, with masks: JPEG 0.72 MB, 36.6 dB and 30 ms; WebP of quality 90 0.49 MB, 35.4 dB and 385 ms.
+The images: the part of each camera's image that shows the subject, as JPEG with colour at full
+resolution, followed by its mask, deflated. WebP halves the colour's resolution, and takes 15 times
+as long, which rules out live rigs. On 20 cameras of wd2, with masks: JPEG 0.72 MB, 36.6 dB and 30
+ms; WebP of quality 90 0.49 MB, 35.4 dB and 385 ms.
 """
 
 import asyncio
@@ -41,11 +42,13 @@ JPEG_QUALITY = 80
 MARGIN_PX = 1
 """Pixels around the subject's part of an image: a bilinear sample outside touches no foreground."""
 KEPT_PX = 8
-"""Pixels further than this from the subject are black: JPEG blocks that reach the subject keep their colours."""
+"""Pixels further than this from the subject are black: JPEG blocks that reach the subject keep
+their colours."""
 MASK_STEP = 17
 """Masks have 16 levels, for half the bytes of 256."""
 COLOUR_STRIDE = 4
-"""Vertices are coloured from images reduced by this factor: neighbouring vertices are several pixels apart."""
+"""Vertices are coloured from images reduced by this factor: neighbouring vertices are several
+pixels apart."""
 READ_S, POLL_S = 10.0, 0.02
 """Time limit for reading a frame, and time between attempts."""
 NOT_IN_TIME = "the frame was not available in time; see /health"
@@ -244,7 +247,8 @@ def _colours(frame: MultiViewFrame, proxy: GeometryProxy) -> Float[np.ndarray, "
 def pack_differences(values: Int[np.ndarray, "row column"]) -> bytes:
     """Integers of 31 bits as deflated differences to the row before, folded to unsigned (0, -1, 1, -2 to 0, 1, 2, 3).
 
-    They are stored column by column: first the lowest byte of all, then the second, the third and the highest.
+    They are stored column by column: first the lowest byte of all, then the second, the
+    third and the highest.
     """
     differences = np.diff(values, axis=0, prepend=np.zeros((1, values.shape[1]), values.dtype)).T
     folded = ((differences << 1) ^ (differences >> 63)).astype("<u4")

@@ -28,7 +28,8 @@ class AccessControl:
     def __init__(self, host: str, token: str | None, public_url: str | None = None) -> None:
         """Set up the checks of one server, which a proxy may serve at a public address.
 
-        ValueError if other machines can reach the server and there is no token, or the token or the address is invalid.
+        ValueError if other machines can reach the server and there is no token, or the token or the
+        address is invalid.
         """
         if token is not None and len(token) < MIN_TOKEN_LENGTH:
             raise ValueError(
@@ -66,8 +67,9 @@ class AccessControl:
     def find_foreign_origin(self, connection: HTTPConnection) -> str | None:
         """The reason to refuse a request that another site's page has caused; None for any other request.
 
-        Such a page has another `Origin`, or embeds an image of ours (`Sec-Fetch-Site`). A page whose own host name
-        resolves to this machine has that name as `Host`. Plain links from any page are allowed.
+        Such a page has another `Origin`, or embeds an image of ours (`Sec-Fetch-Site`). A page
+        whose own host name resolves to this machine has that name as `Host`. Plain links from any
+        page are allowed.
         """
         host = connection.headers.get("host", "")
         address = _parse_host(host, 80)

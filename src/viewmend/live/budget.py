@@ -2,12 +2,14 @@
 
 docs/live.md describes the ladders of quality levels. The control law of `Budget`:
 
-* The time of a level is predicted from the medians of the last `MEMORY_FRAMES` frames, each stage scaled to the level.
-* The level goes down as soon as its own prediction is above the target: to the highest level that is predicted to take
-  at most `HEADROOM` of the target.
-* It goes up by one when the next level is predicted to take at most `HEADROOM` of the target for several frames in a
-  row, at first `UP_AFTER_FRAMES`. A step up that is undone within `PROBATION_FRAMES` doubles this number, up to
-  `MAX_UP_AFTER_FRAMES`; a step that lasts resets it. So the level settles below a wrong prediction.
+* The time of a level is predicted from the medians of the last `MEMORY_FRAMES` frames, each stage
+  scaled to the level.
+* The level goes down as soon as its own prediction is above the target: to the highest level that
+  is predicted to take at most `HEADROOM` of the target.
+* It goes up by one when the next level is predicted to take at most `HEADROOM` of the target for
+  several frames in a row, at first `UP_AFTER_FRAMES`. A step up that is undone within
+  `PROBATION_FRAMES` doubles this number, up to `MAX_UP_AFTER_FRAMES`; a step that lasts resets it.
+  So the level settles below a wrong prediction.
 """
 
 from collections import deque
@@ -27,7 +29,8 @@ PROBATION_FRAMES = 12
 COARSE_FILL_COST = 0.15
 """Cost of a fill without context, relative to the full level."""
 REFINE_FIXED, REFINE_COST = 0.1, 0.3
-"""Cost that does not depend on resolution, and cost of inpainting an arbitrarily small part, relative to all of it."""
+"""Cost that does not depend on resolution, and cost of inpainting an arbitrarily small part,
+relative to all of it."""
 FADE_FIXED, FADE_COST = 0.05, 0.13
 """The same costs if nothing is inpainted and background is only faded."""
 MAX_WAIT_S = 2.5
@@ -51,8 +54,8 @@ class QualityLevel:
     top_k: int | None
     """Context tokens that survive pruning; None for the model's own number."""
     refine_fraction: float | None = None
-    """Part of the subject that is inpainted; None for all that the error rule selects. 0 fades background and fills
-    holes from around them."""
+    """Part of the subject that is inpainted; None for all that the error rule selects. 0 fades
+    background and fills holes from around them."""
 
     @property
     def relative_cost(self) -> float:
@@ -152,8 +155,8 @@ class Budget:
             inpainting = times.inpainting / level.relative_cost
             self._inpainting.append(inpainting)
             if level.context_times:
-                # Relative to inpainting, which every level measures, so that a level without context follows a device
-                # that has become slower.
+                # Relative to inpainting, which every level measures, so that a level without
+                # context follows a device that has become slower.
                 self._context.append(times.context / inpainting)
         self._frames_since_up += 1
         if self._frames_since_up == PROBATION_FRAMES:

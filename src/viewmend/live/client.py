@@ -128,8 +128,8 @@ class Client(Connection):
     token: str | None = None
     timeout_s: float = 30.0
     again_s: float = 0.0
-    """How long to try to reconnect after the connection was lost; then the last view is requested again, at the frame
-    that was shown last. 0: a lost connection is an error."""
+    """How long to try to reconnect after the connection was lost; then the last view is requested
+    again, at the frame that was shown last. 0: a lost connection is an error."""
     messages: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The last message of each type."""
     connections: int = field(default=0, init=False)

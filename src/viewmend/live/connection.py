@@ -247,14 +247,15 @@ class ViewerConnection:
     def inform(self, shared: SharedState) -> float:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        Returns the time before which this need not be called again, unless `shared` changes or the viewer sends a
-        message.
+        Returns the time before which this need not be called again, unless `shared` changes or the
+        viewer sends a message.
         """
         session = self._session
         now = self._now()
         self._send_new_rig()
 
-        # The position of a clock that catches up with a live edge cannot be predicted, nor can states of extensions.
+        # The position of a clock that catches up with a live edge cannot be predicted, nor can
+        # states of extensions.
         catches_up = self._service.source.span.live and session.clock.playing and not session.clock.live
         always_changes = bool(self._registry.extensions) or catches_up
         causes = StateCauses(shared, session.clock_changes, session.buffering)

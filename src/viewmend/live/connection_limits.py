@@ -1,9 +1,10 @@
 """Limits for connections: what unauthenticated clients may send, and what any client may leave unread.
 
-`LimitedConnection` sits between a socket and uvicorn: it is the socket's `asyncio.Protocol`, and the
-`asyncio.Transport` of uvicorn's HTTP and WebSocket protocols. So it can count, delay and drop bytes with public
-interfaces only. A client is unauthenticated until a request has shown the token or, where no token is required, does
-not come from another site's page. docs/live.md lists all limits.
+`LimitedConnection` sits between a socket and uvicorn: it is the socket's
+`asyncio.Protocol`, and the `asyncio.Transport` of uvicorn's HTTP and WebSocket protocols.
+So it can count, delay and drop bytes with public interfaces only. A client is
+unauthenticated until a request has shown the token or, where no token is required, does not
+come from another site's page. docs/live.md lists all limits.
 """
 
 import asyncio
@@ -26,7 +27,8 @@ MAX_UNAUTHENTICATED = 128
 MAX_UNAUTHENTICATED_BYTES = 262_144
 """Bytes that an unauthenticated connection may send in all."""
 MESSAGE_SLACK_BYTES, MESSAGE_SLACK_BYTES_PER_S = 524_288, 1000
-"""Bytes on a WebSocket in addition to the message that is read: of the next message, and of pings and pongs."""
+"""Bytes on a WebSocket in addition to the message that is read: of the next message, and of
+pings and pongs."""
 IDLE_S = 10.0
 """A connection without a complete request is closed after this many seconds."""
 HANDSHAKE_S = 1.0
@@ -36,7 +38,8 @@ UNREAD_S, UNREAD_BYTES = 20.0, 64_000
 PIECE_BYTES = 4096
 """Unauthenticated input is handed to uvicorn in pieces of at most this size."""
 PAUSE_FACTOR, MIN_PAUSE_S = 4.0, 0.005
-"""After a turn, unauthenticated clients wait for this multiple of its processor time, and at least for this long."""
+"""After a turn, unauthenticated clients wait for this multiple of its processor time, and at least
+for this long."""
 TOO_LARGE = b"\x88\x02\x03\xf1"
 """A WebSocket close frame with code 1009, message too large."""
 STATE_KEY = "connection"
@@ -319,7 +322,8 @@ class ConnectionLimits:
                 return message
 
             def raise_if_ended() -> None:
-                # A stopping server ends handshakes. uvicorn would answer them again, but not after this error.
+                # A stopping server ends handshakes. uvicorn would answer them again, but
+                # not after this error.
                 if scope["type"] == "websocket" and connection.is_closing():
                     raise ClientDisconnected
 

@@ -26,7 +26,8 @@ HOLE = (1.0, 0.15, 0.55)
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
 """Colours of the source views in the mode `coverage`."""
 DEPTH_STRIDES = ((160, 1), (400, 2))
-"""Pairs (longest side, stride): image pixels per depth pixel, so that outlines of small images are not ragged."""
+"""Pairs (longest side, stride): image pixels per depth pixel, so that outlines of small images are
+not ragged."""
 COARSEST_STRIDE = 4
 """Image pixels per depth pixel in larger images."""
 LARGE_ERROR = 0.25
@@ -38,10 +39,11 @@ def draw_mode(
 ) -> Image:
     """Draw one of the protocol's modes as 8-bit RGB on a background (hexadecimal RGB).
 
-    rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. completed: Fhat.
-    depth: from red (near) to blue, over `depth_range`. error: from black to yellow (`LARGE_ERROR`). coverage: the
-    colours of the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey where the
-    inpainter does not predict it, or has not yet. The others: as in `RenderResult.extra`.
+    rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule.
+    completed: Fhat. depth: from red (near) to blue, over `depth_range`. error: from black to yellow
+    (`LARGE_ERROR`). coverage: the colours of the source views, missing pixels in pink. confidence:
+    from violet (low) to yellow (high); grey where the inpainter does not predict it, or has not
+    yet. The others: as in `RenderResult.extra`.
     """
     own = (extra or {})[mode] if mode in EXTRA_MODES else None
     if mode == "error" and own is not None:

@@ -68,7 +68,8 @@ class Clock:
     def advance(self, seconds: float, span: Span, edge: float | None = None) -> None:
         """Advance by `seconds`, or to the `edge` if the clock follows it.
 
-        A complete recording starts again after its last frame. One that is still being generated waits at its end.
+        A complete recording starts again after its last frame. One that is still being generated
+        waits at its end.
         """
         if self.live and edge is not None:
             self.position = edge
@@ -131,7 +132,8 @@ class FrameSource(ABC):
         """None before the source is open."""
         self.span = span
         self.spread_ms: float | None = None
-        """Time between the first and the last image of the newest frame, if this process reads the cameras."""
+        """Time between the first and the last image of the newest frame, if this process
+        reads the cameras."""
         self.recording = Clock()
         """The edge of a recording: one position for all viewers that follow it."""
         self.recording.live = False
@@ -202,7 +204,8 @@ class FrameCache:
 class RecordedSource(FrameSource):
     """A recording, read on a thread of low priority: the requested frame and the following ones.
 
-    Frames of a `generated` one (the studio) are made one after the other, and can be requested once they exist.
+    Frames of a `generated` one (the studio) are made one after the other, and can be
+    requested once they exist.
     """
 
     def __init__(

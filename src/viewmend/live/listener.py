@@ -51,7 +51,8 @@ class Server:
     def bind(self) -> Iterator[str]:
         """Take the port; gives the server's address. OSError if the port is in use."""
         family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
-        # With the protocol given, asyncio sets TCP_NODELAY on accepted connections: small answers leave at once.
+        # With the protocol given, asyncio sets TCP_NODELAY on accepted connections: small answers
+        # leave at once.
         with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
             # Accepted connections inherit the size. A small buffer bounds memory and shows who reads slowly.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)

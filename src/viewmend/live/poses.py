@@ -51,8 +51,9 @@ class HomeView:
 def home_view(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> HomeView:
     """Find the axes of the orbit, with azimuths as in `geometry.orbit`, and the initial view.
 
-    The initial view is in the middle of the cameras' arc or, if they stand all around, halfway between the first
-    camera and its neighbour; distance, elevation and field of view are those of the cameras.
+    The initial view is in the middle of the cameras' arc or, if they stand all around,
+    halfway between the first camera and its neighbour; distance, elevation and field of
+    view are those of the cameras.
 
     `center` is the subject's, in metres; `up` the up axis of the world, None to estimate it from the cameras.
     """
@@ -112,8 +113,9 @@ def view_camera(asked: Camera, home: HomeView, size_px: tuple[int, int], scale: 
 def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> tuple[Cameras, Cameras]:
     """The parallel left and right eye of a stereo camera.
 
-    Their principal points are shifted so that both show the depth of `center` (metres) at the same pixel, which is
-    where a screen appears; if it is behind the camera, the eyes converge at infinity.
+    Their principal points are shifted so that both show the depth of `center` (metres) at
+    the same pixel, which is where a screen appears; if it is behind the camera, the eyes
+    converge at infinity.
     """
     z = float(camera.camera_from_world[0, 2, :3] @ center.to(camera.K) + camera.camera_from_world[0, 2, 3])
     eyes = []

@@ -22,7 +22,8 @@ MODES = ("rendered", "holes", "completed", "compared", "depth", "coverage", "con
 COMPLETED_MODES = frozenset({"completed", "confidence"})
 """Modes that need the model's output."""
 EXTRA_MODES = frozenset({"compared", "error", "hull", "points"})
-"""Modes that show something else than the server's own model: another one, its errors, or the geometry proxy alone."""
+"""Modes that show something else than the server's own model: another one, its errors, or the
+geometry proxy alone."""
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512

@@ -15,7 +15,8 @@ from viewmend.live.sessions import ViewerSession
 TICK_S = 0.25
 """The registry checks every this many seconds what its connections have to send."""
 LIVE_TICK_S = 0.1
-"""The interval of these checks while a rig pushes frames, in seconds; a frame that arrives causes one at once."""
+"""The interval of these checks while a rig pushes frames, in seconds; a frame that arrives causes
+one at once."""
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,8 @@ class RenderResult:
     background: str = BLACK
     """Default background, as hexadecimal RGB: the model's own."""
     extra: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
-    """Images by mode of `RenderRequest.extra_modes`, one mapping per eye: RGB in [0, 1], times alpha, and alpha."""
+    """Images by mode of `RenderRequest.extra_modes`, one mapping per eye: RGB in [0, 1], times
+    alpha, and alpha."""
     input_views: tuple[str, ...] = ()
     """Names of the cameras that coloured or completed the first eye's view, those that coloured it first."""
     psnr_db: float | None = None
@@ -186,7 +187,8 @@ class Renderer:
 
         Raises:
             FrameNotReadyError: the frame has not been read yet.
-            ValueError: the frame has no geometry, fewer than two cameras are left, or the true camera is unknown.
+            ValueError: the frame has no geometry, fewer than two cameras are left, or the true
+                camera is unknown.
         """
         if self._stream is None:
             raise FrameNotReadyError

@@ -44,8 +44,8 @@ TOO_MANY_IMAGES = f"expected at most {MAX_IMAGES} images at a time; try again"
 EXTENSIONS = {
     "broadcast": "viewmend.contrib.broadcast.extension:broadcast_extension",
 }
-"""Optional parts of the server: MODULE:FUNCTION of each, imported on demand. The function is called with the option's
-value, checks it, and returns an `ExtensionFactory`."""
+"""Optional parts of the server: MODULE:FUNCTION of each, imported on demand. The function is called
+with the option's value, checks it, and returns an `ExtensionFactory`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,10 +20,12 @@ from viewmend.utils.heap import HeapTrimmer
 TICK_S = 0.004
 """Seconds between checks of the sessions' clocks."""
 LOADING_S, IDLE_S = 0.05, 0.5
-"""The same before the first frame, and while no session wants a view; the first that does wakes the thread."""
+"""The same before the first frame, and while no session wants a view; the first that does
+wakes the thread."""
 AFTER_ERROR_S = 0.5
 Session = ViewerSession | RenderJob[Any]
-"""Requests views. The render thread makes all calls, with the service's lock but for `deliver` and `is_cancelled`."""
+"""Requests views. The render thread makes all calls, with the service's lock but for `deliver` and
+`is_cancelled`."""
 
 log = logging.getLogger("viewmend.live")
 

@@ -118,7 +118,8 @@ class ViewerSession:
         self._wait_ms = 0.0
         """How long the requested look has waited."""
         self._moving_px = 0.0
-        """Pixels of the last look that moved or played. The budget counts in these: a view at rest may have more."""
+        """Pixels of the last look that moved or played. The budget counts in these: a view at rest
+        may have more."""
         self._encoders = Encoders()
 
     def look(self, look: Look) -> None:

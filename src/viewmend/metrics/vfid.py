@@ -1,9 +1,9 @@
 """VFID (Wang et al. 2018): Frechet distance between two sets of videos in the features of I3D. Lower is better.
 
-As usual in video inpainting: the feature vector of a video is I3D's Mixed_5c, averaged over time and space (1024
-numbers), and images are in [0, 1], although I3D was trained on [-1, 1]. Published scripts do not call `eval()`, so
-that I3D normalises with the statistics of each video: mode "train". The value depends on the number of videos: compare
-only results of the same set.
+As usual in video inpainting: the feature vector of a video is I3D's Mixed_5c, averaged over time
+and space (1024 numbers), and images are in [0, 1], although I3D was trained on [-1, 1]. Published
+scripts do not call `eval()`, so that I3D normalises with the statistics of each video: mode
+"train". The value depends on the number of videos: compare only results of the same set.
 
 I3D (Carreira & Zisserman 2017) has the key names of piergiaj/pytorch-i3d.
 """

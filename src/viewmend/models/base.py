@@ -1,8 +1,8 @@
 """The base class of all inpainters, and what `step` receives: the view, its context and the viewer's state.
 
-An inpainter completes one view at a time: `step(view, context, state) -> (completed, state)`. It keeps nothing between
-calls. What one viewer's view leaves for the next is the state; what is computed once per frame and shared by all
-viewers is kept by the `ContextProvider`.
+An inpainter completes one view at a time: `step(view, context, state) -> (completed, state)`. It
+keeps nothing between calls. What one viewer's view leaves for the next is the state; what is
+computed once per frame and shared by all viewers is kept by the `ContextProvider`.
 """
 
 import math
@@ -21,8 +21,8 @@ from viewmend.utils.tensors import extremes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
-"""views(time, names): the cameras of these names in the frame `time`, with the proxy's depth. Cameras without an image
-in that frame are left out; None if all are."""
+"""views(time, names): the cameras of these names in the frame `time`, with the proxy's depth.
+Cameras without an image in that frame are left out; None if all are."""
 Memory = dict[tuple[str, str], Any]
 """What was computed from one frame, by (kind, camera name)."""
 T = TypeVar("T")
@@ -44,12 +44,13 @@ class RenderQuality:
     top_k: int | None = None
     """Context tokens that survive pruning; None for the model's own number."""
     context_times: int | None = None
-    """How many frames of the temporal window are context, the latest first (1: only the view's own); None for all.
-    With 0 no camera image is encoded: the paper's model then completes patches from the view's own patches."""
+    """How many frames of the temporal window are context, the latest first (1: only the view's
+    own); None for all. With 0 no camera image is encoded: the paper's model then completes patches
+    from the view's own patches."""
     refine_fraction: float | None = None
-    """Re-synthesise at most this fraction of the proxy's pixels, those with the highest predicted gain; holes are
-    always filled. None: all pixels of the error mask. With 0, holes are filled from their surroundings, and pixels
-    that are predicted to be background are attenuated."""
+    """Re-synthesise at most this fraction of the proxy's pixels, those with the highest predicted
+    gain; holes are always filled. None: all pixels of the error mask. With 0, holes are filled from
+    their surroundings, and pixels that are predicted to be background are attenuated."""
 
     def __post_init__(self) -> None:
         if self.refine_fraction is not None and not 0 <= self.refine_fraction <= 1:
@@ -67,9 +68,9 @@ def check_exclude(exclude: Sequence[str]) -> None:
 class ContextProvider:
     """The camera images that an inpainter may use, and a memory of what it computed from them.
 
-    `provider(time, names)` returns these cameras in the frame `time`, or None. Code that calls `step` directly makes
-    one provider for all views of its stream. `viewmend.Stream` makes one per view, with a memory that all viewers
-    share.
+    `provider(time, names)` returns these cameras in the frame `time`, or None. Code that calls
+    `step` directly makes one provider for all views of its stream. `viewmend.Stream` makes one per
+    view, with a memory that all viewers share.
 
     Examples:
         >>> from viewmend import ContextProvider, Stream, make_method
@@ -96,7 +97,8 @@ class ContextProvider:
             views: returns cameras by frame and name.
             quality: how much the view may cost.
             exclude: names of cameras that must not be used.
-            memory: returns the memory of a frame; by default the provider keeps one for each of the last frames.
+            memory: returns the memory of a frame; by default the provider keeps one for
+                each of the last frames.
 
         Raises:
             ValueError: `exclude` is a string.
@@ -124,14 +126,16 @@ class ContextProvider:
     ) -> list[Any]:
         """The encodings of these cameras in these frames, in the order of frames and then of names.
 
-        Cameras without an image are left out. `encode` is called once, with every frame that has cameras which are not
-        in the memory yet; it returns one result per camera for each element of its argument.
+        Cameras without an image are left out. `encode` is called once, with every frame that has
+        cameras which are not in the memory yet; it returns one result per camera for each element
+        of its argument.
 
         Args:
             times: indices of the frames.
             names: the cameras.
             encode: computes the encodings.
-            kind: distinguishes the encodings from those of other models in the same memory (`Network.encoding_kind`).
+            kind: distinguishes the encodings from those of other models in the same memory
+                (`Network.encoding_kind`).
         """
         usable = [name for name in names if name not in self._exclude]
         memories = {time: self._memory(time) for time in times}
@@ -167,7 +171,8 @@ class ContextProvider:
             time: index of the frame.
             kind: distinguishes these results from others of the same cameras.
             names: the cameras.
-            make: computes one result for each of the names that it is given; called with those that are missing.
+            make: computes one result for each of the names that it is given; called with
+                those that are missing.
             device: where `make` computes; its time is counted as encoding.
         """
         memory = self._memory(time)
@@ -242,13 +247,15 @@ class Inpainter:
     error_rule: str = "holes"
     """The error rule that this inpainter is made for (`rendering.error_mask`)."""
     background: Background | None = None
-    """The background that its output is painted on. None: the background of its input, as for classical fills."""
+    """The background that its output is painted on. None: the background of its input, as for
+    classical fills."""
     predicts_errors: bool = False
     """Whether `predict_errors` is implemented."""
     predicts_depth: bool = False
     """Whether `predict_depth` is implemented."""
     window_frames: int = 0
-    """How many frames back `step` asks its context for. A stream keeps these frames, if its memory holds them."""
+    """How many frames back `step` asks its context for. A stream keeps these frames, if its memory
+    holds them."""
 
     def initial_state(self) -> State:
         """The state before the first view of a viewer."""

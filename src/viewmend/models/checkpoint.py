@@ -50,11 +50,11 @@ def load_inpainter(
     """Load a shipped model or a model folder, ready for `Stream`.
 
     Args:
-        name_or_path: one of `shipped_models()`, or a folder written by `save_inpainter` (./NAME if both
-            exist and the folder is meant).
+        name_or_path: one of `shipped_models()`, or a folder written by `save_inpainter` (./NAME if
+            both exist and the folder is meant).
         device: where it runs.
-        precision: float32, bfloat16 (by autocast), or auto: bfloat16 for models trained in it, if the device has units
-            for it.
+        precision: float32, bfloat16 (by autocast), or auto: bfloat16 for models trained in it, if
+            the device has units for it.
 
     Raises:
         MissingCheckpointError: there is no such folder or name, or a file is missing.

@@ -77,8 +77,9 @@ class NearestColour(Fill):
 class ReprojectionFill(Fill):
     """Each pixel of E takes the colour that the cameras have at its point on the proxy.
 
-    The cameras closest to the view are sampled first, in its own frame, then the source views in past frames, the
-    latest first. Points that no camera sees are filled smoothly from their surroundings.
+    The cameras closest to the view are sampled first, in its own frame, then the source
+    views in past frames, the latest first. Points that no camera sees are filled smoothly
+    from their surroundings.
     """
 
     def __init__(self, cameras: int = 8) -> None:

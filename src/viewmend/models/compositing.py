@@ -89,8 +89,9 @@ def from_background(background: Background, completed: CompletedView, view: Inco
 def opaque_in_mask(completed: CompletedView) -> CompletedView:
     """The view with alpha 1 where E > 0 and the target mask shows the subject; unchanged without a target mask.
 
-    There a lower alpha is an error: it would let the background through. Pixels whose own colour is unreliable, because
-    their alpha is low, take the mean colour of the smallest block around them that is opaque enough.
+    There a lower alpha is an error: it would let the background through. Pixels whose own colour is
+    unreliable, because their alpha is low, take the mean colour of the smallest block around them
+    that is opaque enough.
     """
     view, alpha = completed.view, completed.alpha
     if view.target_mask is None or alpha is None:

@@ -10,8 +10,9 @@ from viewmend.models.base import Inpainter
 from viewmend.models.compositing import Background
 
 BFLOAT16_UNITS = ("amx_bf16", "avx512_bf16")
-"""Features of x86 processors with which layers are faster in bfloat16 than in float32: 5 to 7 times with matrix units
-(AMX), 1.7 to 1.9 times with vectors of 512 bits. Without either, bfloat16 is up to ten times slower."""
+"""Features of x86 processors with which layers are faster in bfloat16 than in float32: 5 to 7 times
+with matrix units (AMX), 1.7 to 1.9 times with vectors of 512 bits. Without either, bfloat16 is up
+to ten times slower."""
 
 
 class Network(nn.Module, Inpainter):

@@ -45,14 +45,16 @@ METHODS: dict[str, str] = {
 FAMILIES = dict.fromkeys(
     ("dstt", "fuseformer", "e2fgvi"), "viewmend.contrib.baselines.published:make_baseline"
 )
-"""MODULE:NAME of the factory of all methods whose names start with this word; called with the name and the device."""
+"""MODULE:NAME of the factory of all methods whose names start with this word; called with the name
+and the device."""
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"
     for network in ("dstt", "fuseformer", "e2fgvi")
     for weights in ("", "-finetuned")
     for framing in ("def", "win", "mul")
 )
-"""The baselines of the paper's Table 1, in its order: pretrained, then fine-tuned. `baselines.published` has more."""
+"""The baselines of the paper's Table 1, in its order: pretrained, then fine-tuned.
+`baselines.published` has more."""
 
 
 def method_names(selection: str) -> tuple[str, ...]:
@@ -74,13 +76,13 @@ def method_names(selection: str) -> tuple[str, ...]:
 def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpainter:
     """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
 
-    For FILE.py:NAME, the file's NAME is called, with the device if it takes one; it must return a `viewmend.Inpainter`.
-    Only models on disk use `precision`, as `load_inpainter`.
+    For FILE.py:NAME, the file's NAME is called, with the device if it takes one; it must return a
+    `viewmend.Inpainter`. Only models on disk use `precision`, as `load_inpainter`.
 
     Raises:
         MethodMissing: its weights are not installed.
-        ValueError: the name or the precision is unknown, the method is not an `Inpainter`, or it cannot be loaded
-            (`WeightsError`).
+        ValueError: the name or the precision is unknown, the method is not an `Inpainter`, or it
+            cannot be loaded (`WeightsError`).
 
     Examples:
         >>> from viewmend import make_method

@@ -61,9 +61,9 @@ class SmoothFill(Fill):
 def fill(rgb: Image, missing: Pixels, subject: Pixels) -> Image:
     """The image with every missing pixel filled from the others, which are unchanged, bit for bit.
 
-    Pixels of thin holes become the mean of known pixels nearby, weighted by distance, background included: at a
-    silhouette they are half background. In wide holes only pixels of the `subject` count; farther than `REACH_PX` from
-    any of these, holes are filled by `pull_push`.
+    Pixels of thin holes become the mean of known pixels nearby, weighted by distance, background
+    included: at a silhouette they are half background. In wide holes only pixels of the `subject`
+    count; farther than `REACH_PX` from any of these, holes are filled by `pull_push`.
     """
     near, _ = from_near(rgb, ~missing, missing)
     wide = missing & spread(~spread(~missing))
@@ -110,8 +110,8 @@ def spread(pixels: Pixels) -> Pixels:
 def pull_push(rgb: Image, known: Pixels) -> Image:
     """The image with every unknown pixel filled smoothly from the known ones, which are unchanged, bit for bit.
 
-    Pull: means of the known pixels at halved resolutions, down to one pixel. Push: unknown pixels get the interpolated
-    colour of the coarser level. Without any known pixel the fill is 0.
+    Pull: means of the known pixels at halved resolutions, down to one pixel. Push: unknown pixels
+    get the interpolated colour of the coarser level. Without any known pixel the fill is 0.
     """
     weight = known.to(rgb)[None, None]
     levels = [(rgb[None] * weight, weight)]

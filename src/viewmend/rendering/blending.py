@@ -16,7 +16,8 @@ from viewmend.types import ContextViews
 GRAZING = 0.1
 """The slope term of the depth test stays constant below this cosine between normal and camera."""
 ROWS = 16
-"""A thread's task on the CPU has this many rows of the novel view; few, because the subject fills only some."""
+"""A thread's task on the CPU has this many rows of the novel view; few, because the subject
+fills only some."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,8 @@ class BlendConfig:
 
     weight = usable * (n . v)^normal_power * (cosine between camera and viewer)^view_power
 
-    where `usable` is the bilinear weight of those of the four pixels around the sample that are foreground and visible.
+    where `usable` is the bilinear weight of those of the four pixels around the sample that are
+    foreground and visible.
     """
 
     normal_power: int = 2
@@ -60,9 +62,9 @@ def blend(
 ) -> Blend:
     """Colour the surface visible in `camera` from the images of `sources`.
 
-    Samples are bilinear. Of the four pixels only those count that are foreground (by the soft mask) and from which the
-    point is visible, so that neither background nor an occluder's rim bleeds in. A camera does not contribute to points
-    behind it, outside its image, or facing away from it.
+    Samples are bilinear. Of the four pixels only those count that are foreground (by the soft mask)
+    and from which the point is visible, so that neither background nor an occluder's rim bleeds in.
+    A camera does not contribute to points behind it, outside its image, or facing away from it.
 
     Args:
         camera: the novel view (one).
@@ -134,7 +136,8 @@ def blend_torch(
     config: BlendConfig,
 ) -> Blend:
     """`blend` in torch, for any device."""
-    # the points of all pixels, those without a surface at depth 1: to find the others would wait for the device
+    # the points of all pixels, those without a surface at depth 1: to find the others would wait
+    # for the device
     uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device).view(1, -1, 2)
     covered = depth.flatten() > 0
     points = unproject(uv_px, torch.where(covered, depth.flatten(), 1.0)[None], camera)[0]

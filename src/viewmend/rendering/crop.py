@@ -123,8 +123,9 @@ def subject_crop(view: IncompleteView, margin_px: int) -> Crop:
 def grid_px(margin_px: int) -> int:
     """Crops that are inpainted begin and end at multiples of this.
 
-    It is the first power of two, from a patch's step on, that is not less than the margin: smooth fills halve the
-    resolution several times, and so mostly average the same pixels as in the whole view.
+    It is the first power of two, from a patch's step on, that is not less than the margin:
+    smooth fills halve the resolution several times, and so mostly average the same pixels
+    as in the whole view.
     """
     return max(PATCH_STEP_PX, 1 << (margin_px - 1).bit_length())
 

@@ -1,7 +1,8 @@
 """The error mask E of a view: which of its pixels must be inpainted.
 
-`decide_error_mask` is called once per view, between rendering and inpainting. An error rule marks pixels from what the
-renderer knows; then, if only a fraction of them may be re-synthesised, a model predicts where that gains most.
+`decide_error_mask` is called once per view, between rendering and inpainting. An error rule marks
+pixels from what the renderer knows; then, if only a fraction of them may be re-synthesised, a model
+predicts where that gains most.
 """
 
 from collections.abc import Callable
@@ -63,7 +64,8 @@ def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:
 
 
 ERROR_RULES: dict[str, ErrorRule] = {"holes": holes, "all": all_covered, "predicted": all_covered}
-"""The rules by name. `predicted` starts from all covered pixels and keeps those with the highest predicted gain."""
+"""The rules by name. `predicted` starts from all covered pixels and keeps those with the highest
+predicted gain."""
 
 
 def error_rule(name: str) -> ErrorRule:
@@ -98,9 +100,9 @@ def decide_error_mask(
 ) -> IncompleteView:
     """The view with its final error mask.
 
-    If `inpainter` predicts errors itself, E becomes soft where `fraction` limits it: 1 where a pixel is to be
-    re-synthesised, and elsewhere the predicted background fraction, by which the pixel is attenuated (`view.fade`).
-    For other inpainters the mask stays binary.
+    If `inpainter` predicts errors itself, E becomes soft where `fraction` limits it: 1 where a
+    pixel is to be re-synthesised, and elsewhere the predicted background fraction, by which the
+    pixel is attenuated (`view.fade`). For other inpainters the mask stays binary.
 
     Args:
         view: the view as rendered.

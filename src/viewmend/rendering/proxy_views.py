@@ -22,11 +22,14 @@ DOT = 0.7
 MAX_DOT_PX = 32
 """A dot's side has at most this many pixels."""
 BEHIND = 1.5
-"""A vertex is hidden if it lies this far behind the visible surface, in distances between neighbouring vertices."""
+"""A vertex is hidden if it lies this far behind the visible surface, in distances between
+neighbouring vertices."""
 FRONTAL_POWER = 4
-"""A camera's weight at a vertex is this power of the cosine between the normal and the direction to the camera."""
+"""A camera's weight at a vertex is this power of the cosine between the normal and the direction to
+the camera."""
 BIAS = 0.01
-"""A vertex is hidden if it lies this far behind the proxy's depth, as a fraction of the diagonal of the hull's box."""
+"""A vertex is hidden if it lies this far behind the proxy's depth, as a fraction of the diagonal of
+the hull's box."""
 MIN_MASK = 0.5
 """A sample is ignored if its foreground fraction is below this."""
 MIN_WEIGHT = 1e-4

@@ -37,13 +37,14 @@ class RenderConfig:
     cameras: int = 3
     """Number of source cameras that colour a view: those closest to it (the paper: 3)."""
     selection: str = "angle"
-    """What makes a camera close: 'angle', a small angle at the subject's centre; 'direction', a similar viewing
-    direction, as in RIFTCast."""
+    """What makes a camera close: 'angle', a small angle at the subject's centre; 'direction', a
+    similar viewing direction, as in RIFTCast."""
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the source cameras' colours are weighted."""
     error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no source camera colours; 'all' of the subject; 'predicted', those that a model
-    predicts to be wrong; or FILE.py:NAME. None: the rule that the inpainter is made for."""
+    """Pixels to inpaint: 'holes', which no source camera colours; 'all' of the subject;
+    'predicted', those that a model predicts to be wrong; or FILE.py:NAME. None: the rule that the
+    inpainter is made for."""
     refine_fraction: float = 0.15
     """Rule 'predicted': largest fraction of the subject's pixels to inpaint, all holes first."""
 
@@ -181,9 +182,10 @@ def select_closest(
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 
-    The paper does not define closeness. Here it is the angle at the subject's centre between the directions to the two
-    cameras: the angle decides how similar the images are, the distance only changes their scale. With the selection
-    'direction' it is the angle between the optical axes, for cameras that look at different places. Returns fewer than
+    The paper does not define closeness. Here it is the angle at the subject's centre
+    between the directions to the two cameras: the angle decides how similar the images are,
+    the distance only changes their scale. With the selection 'direction' it is the angle
+    between the optical axes, for cameras that look at different places. Returns fewer than
     k names if there are fewer cameras.
     """
     target = target.on_host

@@ -62,9 +62,10 @@ def capture_set(
 ) -> tuple[CaptureScene, ...]:
     """Every camera of a capture left out in turn.
 
-    `inputs` are "all" others, or a number of cameras, chosen by `evenly_around`, without the held-out one. `frames` is
-    how many from the first, `format` the capture's, None to recognise it. CaptureError if the capture cannot be read,
-    or has no masks or too few cameras; ValueError if `inputs` or `frames` is no such number.
+    `inputs` are "all" others, or a number of cameras, chosen by `evenly_around`, without the
+    held-out one. `frames` is how many from the first, `format` the capture's, None to recognise it.
+    CaptureError if the capture cannot be read, or has no masks or too few cameras; ValueError if
+    `inputs` or `frames` is no such number.
     """
     capture = open_masked(folder, held=1, format=format)
     names = capture.cameras.names
@@ -169,9 +170,10 @@ def make_splits(
 ) -> SplitFile:
     """Split captures so that no subject is in both parts, and choose the camera that each leaves out.
 
-    The order of subjects and the cameras follow from hashes of their names and the seed alone: the same on every
-    machine, and adding a capture does not change the cameras of the others. ValueError for fewer than two subjects, a
-    name without a subject, two scenes of one name, or fewer than 4 cameras.
+    The order of subjects and the cameras follow from hashes of their names and the seed alone: the
+    same on every machine, and adding a capture does not change the cameras of the others.
+    ValueError for fewer than two subjects, a name without a subject, two scenes of one name, or
+    fewer than 4 cameras.
     """
     made = [_scene(path, base, seed, subject, format) for path in captures]
     names = [scene.name for scene in made]

@@ -17,8 +17,8 @@ from viewmend.types import MultiViewFrame, Silhouettes
 Split = Literal["training", "validation", "test"]
 
 Protocol = Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"]
-"""What is known of the held-out camera: nothing; nothing, but M_t of the view is predicted (`MaskPredictor`); its mask,
-as M_t; or its mask, which carves the hull."""
+"""What is known of the held-out camera: nothing; nothing, but M_t of the view is predicted
+(`MaskPredictor`); its mask, as M_t; or its mask, which carves the hull."""
 
 PROCEDURAL_SEEDS: Mapping[Split, range] = {
     "training": range(9000),
@@ -33,9 +33,9 @@ TEST_FOLDER = "test"
 def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
     """Folders or files of characters, motions or captures, as this split may use them.
 
-    Validation uses none: its procedural people are new to every model. `viewmend evaluate` measures what a model gains
-    on recordings that were kept for tests.
-    ValueError if training or validation would look at what is kept for tests.
+    Validation uses none: its procedural people are new to every model. `viewmend evaluate` measures
+    what a model gains on recordings that were kept for tests. ValueError if training or validation
+    would look at what is kept for tests.
     """
     kept = [place for place in places if TEST_FOLDER in (place.resolve().name, place.resolve().parent.name)]
     if kept and split != "test":
@@ -72,7 +72,8 @@ class LeaveOneOutFrame:
     backward_flow_px: Float[Tensor, "height width 2"] | None = None
     """Where in the previous true image each pixel's surface point was (`backward_flow`); None if unknown."""
     seen: SurfaceSeen | None = None
-    """Which input cameras see, now and in the frames of the window, the surface in each pixel; None if unknown."""
+    """Which input cameras see, now and in the frames of the window, the surface in each pixel; None
+    if unknown."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ class LeaveOneOut:
     bounds: Bounds | None = None
     """The volume that may hold the subject, None to find it."""
     cameras: Callable[[str], Cameras] | None = None
-    """cameras(held): the rig's calibration as it is known without that camera's image; None where it is the frames'."""
+    """cameras(held): the rig's calibration as it is known without that camera's image; None where
+    it is the frames'."""
     true_view: Callable[[str, int], MultiViewFrame] | None = None
     """true_view(held, time): what that camera should have seen; None where its own image is the truth."""
 

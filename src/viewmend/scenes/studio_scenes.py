@@ -34,10 +34,12 @@ FRAMES = 10
 SIZE_PX = 512
 """The longer side of the images, pixels."""
 LONG_FRAMES = 41
-"""Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
+"""Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's
+window is whole."""
 TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
 TURN_RINGS = (8, 7)
-"""Rings in which holes are a few percent of the subject, and many of their pixels are seen only in the past."""
+"""Rings in which holes are a few percent of the subject, and many of their pixels are seen
+only in the past."""
 RIG_SEEDS = PROCEDURAL_SEEDS["test"][300:700]
 """Seeds of candidates for the procedural scenes of R48 and R34."""
 RIG_PERFORMER_SEEDS = PROCEDURAL_SEEDS["test"][20000:]
@@ -47,7 +49,8 @@ RIG_TIMES = tuple(sorted(window_times(30, paper())))
 RIG_COLOURED = 8
 """Cameras with images in the scored frame of R48 and R34: as many as models that sample along rays read."""
 COLOURED_BEFORE = 4
-"""Cameras with images in earlier frames: the three source cameras and one more, since the hull decides which three."""
+"""Cameras with images in earlier frames: the three source cameras and one more, since the hull
+decides which three."""
 TURNS: tuple[tuple["Tempo", str], ...] = (("calm", "turn"), ("dance", "spin"))
 
 Background = Literal["black", "stage"]
@@ -71,8 +74,8 @@ class StudioScene(LeaveOneOutScene):
     times: tuple[int, ...] = ()
     """Frames that are drawn; () for all."""
     coloured: int | None = None
-    """Cameras whose images are drawn in the last frame, those closest to the held-out one; all others give their masks
-    alone. None draws all images."""
+    """Cameras whose images are drawn in the last frame, those closest to the held-out one; all
+    others give their masks alone. None draws all images."""
 
     @property
     def definition(self) -> str:
@@ -194,11 +197,12 @@ def rig_set(
 ) -> tuple[StudioScene, ...]:
     """R48, 48 cameras in three layers as in DNA-Rendering, or R34, a dome of 34 cameras as in RIFTCast's data set.
 
-    They show procedural people, and with a `folder` the glTF people of set Q, each with every motion. One camera is
-    left out, all others carve the hull, and the three closest colour the view of the one scored frame. The camera is
-    chosen so that at least 200 hole pixels lie inside its true mask at 512 x 512 (`rig_views.csv`, which
-    research/choose_rig_views.py makes). Scenes without such a view are left out. If the file knows none of the glTF
-    people, all their scenes are used, and the seed chooses the camera.
+    They show procedural people, and with a `folder` the glTF people of set Q, each with every
+    motion. One camera is left out, all others carve the hull, and the three closest colour the view
+    of the one scored frame. The camera is chosen so that at least 200 hole pixels lie inside its
+    true mask at 512 x 512 (`rig_views.csv`, which research/choose_rig_views.py makes). Scenes
+    without such a view are left out. If the file knows none of the glTF people, all their scenes
+    are used, and the seed chooses the camera.
     """
     text = (files("viewmend.scenes") / "rig_views.csv").read_text(encoding="utf-8")
     held = {row["scene"]: row["held"] for row in csv.DictReader(text.splitlines())}

@@ -21,8 +21,8 @@ def backward_flow(
 ) -> Float[Tensor, "height width 2"]:
     """Where each pixel's surface point was in the image of the time before, pixels; NaN where it was not seen.
 
-    `now` and `before` are the same triangles of the true surface, `depth_before` is its z-depth then, metres, 0 where
-    there is none. The camera, a single one, stands still.
+    `now` and `before` are the same triangles of the true surface, `depth_before` is its z-depth
+    then, metres, 0 where there is none. The camera, a single one, stands still.
     """
     raster = rasterize(now, camera)
     points = interpolate(before.vertices, now, camera, raster)[0]
@@ -91,8 +91,9 @@ def surface_seen(
 ) -> SurfaceSeen:
     """What the cameras saw, at these times, of the surface that the view of the camera `target` shows.
 
-    `surfaces` are by time. The view's own time is the first and has all cameras; the others may have fewer, and what
-    these saw counts as unseen. `mesh` is the true surface at the view's own time.
+    `surfaces` are by time. The view's own time is the first and has all cameras; the others
+    may have fewer, and what these saw counts as unseen. `mesh` is the true surface at the
+    view's own time.
     """
     raster = rasterize(mesh, target)
     pixels = torch.nonzero(raster.triangle[0] >= 0)

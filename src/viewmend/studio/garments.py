@@ -17,7 +17,8 @@ from viewmend.studio.procedural.fabric import QUIET, WORDS, Canvas, Image, Plane
 from viewmend.studio.retarget import find_parts, node_matrices
 
 LIMBS = {
-    # Name: upper and lower end, and the parts whose joints move it. The trunk stands on the middle of the feet.
+    # Name: upper and lower end, and the parts whose joints move it. The trunk stands on the middle
+    # of the feet.
     "trunk": ("Hips", "", ("Hips", "Spine", "Spine1", "Spine2", "Neck", "LeftShoulder", "RightShoulder")),
     "left arm": ("LeftArm", "LeftForeArm", ("LeftArm", "LeftForeArm")),
     "right arm": ("RightArm", "RightForeArm", ("RightArm", "RightForeArm")),
@@ -40,7 +41,8 @@ SHOULDER_M = 0.75
 SKIN_RAD = (0.42, 0.25)
 """Skin has a hue (direction of a, b in CIELAB) of hands or face, at most this much redder or yellower."""
 SKIN_CHROMA = (0.5, 1.7)
-"""Skin also has a chroma within these multiples of theirs: bare legs are darker, greyer and redder than hands."""
+"""Skin also has a chroma within these multiples of theirs: bare legs are darker, greyer and redder
+than hands."""
 LIGHTNESS = 0.5
 """Weight of lightness relative to the two hues when garments are separated; folds change lightness."""
 MOST_GARMENTS = 4
@@ -53,7 +55,8 @@ FACE_M = 0.06
 MARGIN_PX = 4
 """How far cloth continues, at half size, over texels that no face shows."""
 BODY_SHARE = 0.25
-"""Textures of which less than this lies neither on the head nor on the hands are hair, hats, glasses, gloves."""
+"""Textures of which less than this lies neither on the head nor on the hands are hair, hats,
+glasses, gloves."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,8 @@ class Garments:
     """The cloth of one texture, at half its width and height."""
 
     cover: Float[np.ndarray, "garment height width"]
-    """1 where a garment is, and next to it where no face shows the texture (smaller levels of it do); 0 on hands and
-    head."""
+    """1 where a garment is, and next to it where no face shows the texture (smaller levels of it
+    do); 0 on hands and head."""
     shown: Bool[np.ndarray, "height width"]
     """Texels that a face shows."""
     bare: Bool[np.ndarray, "height width"]
@@ -279,8 +282,9 @@ def vary_cloth(
 ) -> Character:
     """The character in other clothes; skin, hair and eyes are unchanged.
 
-    Each garment is found by its colour, and with a chance of `variety` either dyed (its own pattern in
-    other hues) or replaced by a seeded cloth: plain, striped, checked, printed or lettered, under the garment's folds.
+    Each garment is found by its colour, and with a chance of `variety` either dyed (its own pattern
+    in other hues) or replaced by a seeded cloth: plain, striped, checked, printed or lettered,
+    under the garment's folds.
 
     Raises:
         ValueError: `variety` is not in [0, 1], or the skeleton is not human.

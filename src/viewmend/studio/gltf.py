@@ -87,7 +87,8 @@ class Document:
         entry = self.entry("materials", material) if material >= 0 else {}
         pbr = entry.get("pbrMetallicRoughness", {})
         factor = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1])[:3], dtype=np.float32)
-        # glTF factors are linear light; the power 1/2.2 is within 1 % of the sRGB curve and multiplies through.
+        # glTF factors are linear light; the power 1/2.2 is within 1 % of the sRGB curve and
+        # multiplies through.
         tint = factor[:, None, None] ** (1 / 2.2)
         if "baseColorTexture" not in pbr:
             return tint

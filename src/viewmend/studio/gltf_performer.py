@@ -26,10 +26,11 @@ FLIGHT_M = 0.03
 class GltfPerformer:
     """One character with one motion: implements `Performer`.
 
-    The clip starts at a seeded moment such that `duration_s` fits if the clip is long enough, and turned by a seeded
-    angle; past its end it runs backwards, so that no pose jumps. Where the path leads away from the stage's centre by
-    more than about `ROAM_M`, the stage moves along with its slow part, like a treadmill. The floor is found once per
-    clip: the lowest vertex stands on it in the median frame, or slightly above in clips with jumps.
+    The clip starts at a seeded moment such that `duration_s` fits if the clip is long enough, and
+    turned by a seeded angle; past its end it runs backwards, so that no pose jumps. Where the path
+    leads away from the stage's centre by more than about `ROAM_M`, the stage moves along with its
+    slow part, like a treadmill. The floor is found once per clip: the lowest vertex stands on it in
+    the median frame, or slightly above in clips with jumps.
     """
 
     def __init__(

@@ -132,7 +132,8 @@ def imperfect_masks(
 def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfections, seeds: Seeds) -> Picture:
     """Spill, then exposure and white balance in linear light, noise, compression.
 
-    Gains and strengths of noise are looked up by 8-bit level: powers for every pixel would cost as much as drawing.
+    Gains and strengths of noise are looked up by 8-bit level: powers for every pixel would cost as
+    much as drawing.
     """
     seed, view, time = seeds
     if it.spill and background is not None:

@@ -54,8 +54,9 @@ class BoundMesh:
     def posed(self, world_from_bind: Float[Tensor, "joint 4 4"]) -> TexturedMesh:
         """The mesh in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
 
-        `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind matrix. The normals
-        are turned by the same blend and of unit length; vertices that coincide and share a normal keep sharing it.
+        `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind
+        matrix. The normals are turned by the same blend and of unit length; vertices that coincide
+        and share a normal keep sharing it.
         """
         rows = world_from_bind[:, :3].reshape(-1, 12)
         # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.

@@ -49,8 +49,8 @@ class Lights:
 def stage_lights(seed: int) -> Lights:
     """Seeded lights as on a capture stage: much the same from all sides, and a little not.
 
-    A surrounding that is brighter above than below gives the share `EVENNESS`; three large soft lamps of slightly
-    different strength and tint, around and above, give the rest.
+    A surrounding that is brighter above than below gives the share `EVENNESS`; three large soft
+    lamps of slightly different strength and tint, around and above, give the rest.
     """
     generator = torch.Generator().manual_seed(seed)
     # Directions spread evenly over a sphere (a Fibonacci spiral).
@@ -67,7 +67,8 @@ def stage_lights(seed: int) -> Lights:
     tint = 1 + 0.08 * (2 * torch.rand(3, 3, generator=generator) - 1)
     power = (0.5 + torch.rand(3, 1, generator=generator)) * tint
     lobes = torch.exp(6 * (toward @ lamps.T - 1)) @ power
-    # A white wall of any heading reflects the same on average, whatever the seed: exposure is the camera's matter.
+    # A white wall of any heading reflects the same on average, whatever the seed: exposure is the
+    # camera's matter.
     heading = torch.arange(16) * math.pi / 8
     walls = torch.stack([heading.cos(), torch.zeros(16), heading.sin()], -1)
     facing = (walls @ toward.T).clamp(min=0)
@@ -113,7 +114,8 @@ def visibility(
 def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height width"]:
     """Linear light behind the subject in each camera's image: a wall that darkens downwards into a floor.
 
-    The colours are seeded and depend on the elevation of a ray only, so that all cameras agree on a distant backdrop.
+    The colours are seeded and depend on the elevation of a ray only, so that all cameras agree on a
+    distant backdrop.
     """
     generator = torch.Generator().manual_seed(seed)
     wall = torch.tensor(_WALLS[int(torch.randint(len(_WALLS), (), generator=generator))])
@@ -158,8 +160,8 @@ def render(
 ) -> MultiViewFrame:
     """Draw a lit scene into every camera, as the frame of time 0.
 
-    Each pixel is shaded at samples_per_side x samples_per_side points, which gives its colour and coverage; the depth
-    is that of its centre. All arguments are on the CPU.
+    Each pixel is shaded at samples_per_side x samples_per_side points, which gives its colour and
+    coverage; the depth is that of its centre. All arguments are on the CPU.
 
     Args:
         surface: what `light` made.

@@ -90,8 +90,9 @@ def family_table(family: str) -> dict[str, str]:
 def find_parts(names: Sequence[str]) -> dict[str, str]:
     """Part -> joint name of any skeleton, given with parents first; parts that it lacks are absent.
 
-    A family's table is taken where its required parts are all there, under any common prefix such as `mixamorig:`
-    (the family with the most parts wins); otherwise the parts are guessed from the words in the names.
+    A family's table is taken where its required parts are all there, under any common prefix such
+    as `mixamorig:` (the family with the most parts wins); otherwise the parts are guessed from the
+    words in the names.
 
     Raises:
         ValueError: a required part (hips, arms, legs) is found in neither way.
@@ -160,7 +161,8 @@ def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
 
 
 _LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
-"""Limbs whose rest directions are aligned, and the part that each points to; hands turn with their forearms."""
+"""Limbs whose rest directions are aligned, and the part that each points to; hands turn
+with their forearms."""
 
 Rest = Mapping[str, Float[Tensor, "3"]]
 """Part -> position of its joint in a rest pose."""
@@ -170,15 +172,17 @@ Rest = Mapping[str, Float[Tensor, "3"]]
 class Retarget:
     """A motion made ready for a character: R_j(t) = G_s(j)(t) A_j R0_j for each mapped joint j.
 
-    Both are first brought upright (y up, facing +z, metres): by a turn to the nearest axes, from where the hips, the
-    head and the two sides lie in the rest poses, and the character by a power of ten where it is no one's height.
+    Both are first brought upright (y up, facing +z, metres): by a turn to the nearest axes, from
+    where the hips, the head and the two sides lie in the rest poses, and the character by a power
+    of ten where it is no one's height.
     """
 
     character: Character
     upright_from_file: Float[Tensor, "4 4"]
     """The motion that brings the character upright."""
     driver: tuple[int, ...]
-    """For each node of the character the position among `rotations`' joints that turns it, -1 where none does."""
+    """For each node of the character the position among `rotations`' joints that turns it,
+    -1 where none does."""
     rotations: Float[Tensor, "frame driver 3 3"]
     """G_s(j)(t) A_j R0_j of the driven nodes."""
     hips: int
@@ -229,7 +233,8 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     driver = [-1] * len(names)
     for place, part in enumerate(parts):
         driver[node_of[part]] = place
-    # s (p + G_root o_b) - G_root o_a, scaled by leg length: the middle of the hip joints moves as the actor's.
+    # s (p + G_root o_b) - G_root o_a, scaled by leg length: the middle of the hip joints moves as
+    # the actor's.
     hips = _joint_path(motion, joint_of["Hips"]) @ turn.T
     hips_turn = rotations[:, joint_of["Hips"]]
     scale = _leg_length(own) / _leg_length(actor)
@@ -246,7 +251,8 @@ def node_matrices(
 ) -> Float[Tensor, "node 4 4"]:
     """World matrices of the nodes: driven ones turned to `turns` (global rotations), the others as at rest.
 
-    Local translations and scales stay those of the file, but the hips' node (if given) is put at its position.
+    Local translations and scales stay those of the file, but the hips' node (if given) is
+    put at its position.
     """
     start = upright_from_file[:3, :3]
     unit = start / start[0].norm()

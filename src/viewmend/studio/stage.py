@@ -36,8 +36,8 @@ class StudioConfig:
     """
 
     seed: int = 0
-    """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are
-    kept for tests and evaluation."""
+    """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds
+    from 10000 on are kept for tests and evaluation."""
     cameras: int | Cameras = 12
     """How many cameras the rig has, or the rig itself, in the stage's world."""
     rig: Literal["ring", "dome", "layers"] = "ring"
@@ -129,7 +129,8 @@ class Studio:
     def read(self, time: int, names: Sequence[str] | None = None) -> MultiViewFrame:
         """The cameras at index `time`: images and masks with the imperfections, and the true depth.
 
-        Only the cameras of these `names` are drawn; None draws all. A camera's image does not depend on the others.
+        Only the cameras of these `names` are drawn; None draws all. A camera's image does not
+        depend on the others.
 
         Raises:
             IndexError: `time` is not in the capture.
@@ -167,8 +168,9 @@ class Studio:
     def truth(self, cameras: Cameras, time: int, on_stage: bool = False) -> MultiViewFrame:
         """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
 
-        Colours are the subject's own, not darkened where the mask is soft: times the mask, they are the view on black.
-        With `on_stage`, and a stage, they include what is behind soft pixels, as in the images of real cameras.
+        Colours are the subject's own, not darkened where the mask is soft: times the mask, they are
+        the view on black. With `on_stage`, and a stage, they include what is behind soft pixels, as
+        in the images of real cameras.
         """
         if on_stage and self._backdrop is not None:
             return self._draw(cameras, time, stage_backdrop(cameras, self._backdrop_seed))

@@ -1,11 +1,13 @@
 """The adversarial loss of section 8, with its patch discriminators.
 
-L_adv = E log D(F*) + E log(1 - D(Fhat)), on Fhat, after the blend. D maximises it and the inpainter minimises it; the
-functions here return what each of the two minimises. The mean is over the logits of an image, then over the images of
-the batch. A view without a hole contributes 0, as in L_in, and trains neither network.
+L_adv = E log D(F*) + E log(1 - D(Fhat)), on Fhat, after the blend. D maximises it and the inpainter
+minimises it; the functions here return what each of the two minimises. The mean is over the logits
+of an image, then over the images of the batch. A view without a hole contributes 0, as in L_in, and
+trains neither network.
 
-The paper does not state the discriminator. Here it is T-PatchGAN (Chang et al. 2019) for clips, and the same network
-without the time axis for images: strided convolutions with spectral normalisation (Miyato et al. 2018).
+The paper does not state the discriminator. Here it is T-PatchGAN (Chang et al. 2019) for clips, and
+the same network without the time axis for images: strided convolutions with spectral normalisation
+(Miyato et al. 2018).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,10 +37,11 @@ class Discriminator(nn.Module):
         """Make a discriminator.
 
         Args:
-            kind: single images, with 5 x 5 kernels; or clips of consecutive frames, with T-PatchGAN's 3 x 5 x 5.
+            kind: single images, with 5 x 5 kernels; or clips of consecutive frames, with
+                T-PatchGAN's 3 x 5 x 5.
             width: channels after the first convolution; doubled twice by later ones.
-            layers: convolutions, each halving height and width; the receptive field of a logit is 61 pixels with 4,
-                253 with 6.
+            layers: convolutions, each halving height and width; the receptive field of a logit is
+                61 pixels with 4, 253 with 6.
         """
         super().__init__()
         C = (3, *(width * 2 ** min(layer, 2) for layer in range(layers)))
@@ -59,8 +62,8 @@ class Discriminator(nn.Module):
     def forward(self, images: Sequence[Float[Tensor, "3 ... _h _w"]]) -> list[Float[Tensor, "logit ..."]]:
         """Logits of images, or of clips of any length, with values in [0, 1]; ValueError below 3 x 3 pixels.
 
-        Images of one size are processed as one batch. In training mode each call makes one step of power iteration, so
-        pass real and completed images in the same call.
+        Images of one size are processed as one batch. In training mode each call makes one step of
+        power iteration, so pass real and completed images in the same call.
         """
         if small := [tuple(image.shape) for image in images if min(image.shape[-2:]) < MIN_SIZE_PX]:
             raise ValueError(

@@ -37,15 +37,18 @@ class SceneConfig:
     rigs: Annotated[tuple[Literal["ring", "dome", "layers"], ...], HIDDEN] = ("ring", "dome")
     """How the cameras of studio rigs are placed; of several ways, one is drawn for each rig."""
     fused_fraction: float = 0.0
-    """Fraction of the scenes of `views` behind geometry that is fused from predicted depth, instead of hulls."""
+    """Fraction of the scenes of `views` behind geometry that is fused from predicted depth,
+    instead of hulls."""
     shared_hull: Annotated[bool, HIDDEN] = False
-    """Whether a quarter of each studio rig's cameras are held out together, and share the hull of the others."""
+    """Whether a quarter of each studio rig's cameras are held out together, and share the hull of
+    the others."""
     num_holdout_views: int = 4
     """Cameras of a scene that are held out, one after the other, to serve as ground truth."""
     imperfect_fraction: float = 0.6
     """Fraction of the studio scenes with noise, colour differences, and errors in masks and calibration."""
     hard_fraction: float = 0.0
-    """Fraction of the imperfect scenes whose calibration errors are up to 4 times as large, mask errors twice."""
+    """Fraction of the imperfect scenes whose calibration errors are up to 4 times as large, mask
+    errors twice."""
     performers: Path | None = None
     """Folder of glTF characters for half of the studio scenes; without it, all people are procedural."""
     motions: Path | None = None
@@ -53,17 +56,20 @@ class SceneConfig:
     performers_fraction: Annotated[float, HIDDEN] = 0.5
     """Fraction of the studio scenes with characters from these folders."""
     captures: tuple[Path, ...] = ()
-    """Folders of your own captures, or files written by `viewmend splits`, of which only the training part is used."""
+    """Folders of your own captures, or files written by `viewmend splits`, of which only the
+    training part is used."""
     hold_out: str | None = None
-    """Camera of the captures to hold back from training, with the last tenth of their frames. The run is validated on
-    both, keeps the best weights, and ends early when they stop improving. 'auto' chooses a camera in rigs of
-    five or more."""
+    """Camera of the captures to hold back from training, with the last tenth of their frames. The
+    run is validated on both, keeps the best weights, and ends early when they stop improving.
+    'auto' chooses a camera in rigs of five or more."""
     protocols: tuple[Literal["strict", "target-mask", "hull-with-target-mask"], ...] = ("strict",)
-    """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for each camera."""
+    """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for
+    each camera."""
     captures_fraction: float = 0.75
     """Fraction of the scenes that come from the captures, if any are given; the rest come from the studio."""
     hull_resolution: Annotated[int, HIDDEN] = 96
-    """Voxels along the longest side of the hull; lower than at run time, as each held-out camera needs its own hull."""
+    """Voxels along the longest side of the hull; lower than at run time, as each held-out camera
+    needs its own hull."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +97,8 @@ class SamplingConfig:
     num_ray_views: int = 0
     """Cameras that models which sample along rays receive: the source views, then the closest others."""
     depth_fraction: float = 0.0
-    """Fraction of the views that are rendered from depth maps with errors instead of the hull, for `views`."""
+    """Fraction of the views that are rendered from depth maps with errors instead of the
+    hull, for `views`."""
     min_hole_px: int = 50
     """Views with fewer pixels to inpaint are skipped."""
 
@@ -104,7 +111,8 @@ class ObjectiveConfig(ABC):
 
     sampling: Annotated[SamplingConfig, HIDDEN]
     objective: ClassVar[Callable[..., Any]]
-    """The class of the `Objective`, called with a `TrainConfig`, this config, and the model to start from or None."""
+    """The class of the `Objective`, called with a `TrainConfig`, this config, and the model to
+    start from or None."""
     item: ClassVar[type]
     """Class of the items of `make_scenes`."""
     whole_shards: ClassVar[bool] = True
@@ -144,7 +152,8 @@ class TrainConfig:
     steps: int
     """Optimisation steps."""
     minutes: float | None = None
-    """End the run after this time or --steps, whichever is first; the learning rate follows the one further along."""
+    """End the run after this time or --steps, whichever is first; the learning rate follows the one
+    further along."""
     batch: int = 8
     """Samples per step; under torchrun, in each process."""
     learning_rate: float = 8e-4
@@ -157,7 +166,8 @@ class TrainConfig:
     checkpoint_minutes: float = 5.0
     """Minutes between checkpoints, from which the same command resumes; 0 writes one after every step."""
     validate_every: int = 500
-    """Steps between validations of the averaged weights, on fixed scenes or what --hold-out holds back; 0: none."""
+    """Steps between validations of the averaged weights, on fixed scenes or what --hold-out holds
+    back; 0: none."""
     seed: int = 0
     """Seed of the weights, the scenes and the samples."""
     new_per_batch: Annotated[int, HIDDEN] = 3

@@ -30,7 +30,8 @@ AUTO = "auto"
 TAIL = 0.1
 """Fraction of a capture's frames that is held back, at its end."""
 MIN_CAMERAS = 5
-"""Smaller rigs keep all their cameras for training: views from two cameras say little about views from three."""
+"""Smaller rigs keep all their cameras for training: views from two cameras say little about views
+from three."""
 MAX_VIEWS = 6
 """Views that a run is validated on."""
 MAX_TABLE = 8
@@ -164,9 +165,9 @@ def _subject_box(mask: Tensor) -> tuple[slice, slice]:
 def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator[HeldBackView]:
     """The views on which a run is validated, or with `table` those of its final table, the held-back camera first.
 
-    A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back camera, all cameras
-    are rendered at frames that are held back. Of a splits file, the first `MAX_VIEWS` captures are used, for the table
-    the first. Raises as `open_training_captures`.
+    A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back
+    camera, all cameras are rendered at frames that are held back. Of a splits file, the first
+    `MAX_VIEWS` captures are used, for the table the first. Raises as `open_training_captures`.
     """
     for opened in open_training_captures(place, hold_out)[: 1 if table else MAX_VIEWS]:
         assert opened.held_back is not None, "something is held back"

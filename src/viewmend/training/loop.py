@@ -57,15 +57,17 @@ def train(
 ) -> Path:
     """Train, or resume the run in `out`; under torchrun, with all of its processes.
 
-    `out` gets the averaged weights (model.safetensors, config.json, README.md), run.safetensors to resume from,
-    log.jsonl, and images of the validation. A resumed run makes exactly the steps it would have made uninterrupted.
+    `out` gets the averaged weights (model.safetensors, config.json, README.md), run.safetensors to
+    resume from, log.jsonl, and images of the validation. A resumed run makes exactly the steps it
+    would have made uninterrupted.
 
     Args:
         config: what to train, and how; its objective may come from outside of the package.
         out: folder for all files.
         start: the model to start from, instead of the one that `config.start` names.
         report: called after each step in the first process.
-        stopped: called after each step in every process; once any returns True, the run ends with a checkpoint.
+        stopped: called after each step in every process; once any returns True, the run
+            ends with a checkpoint.
 
     Returns:
         `out`.
@@ -73,8 +75,8 @@ def train(
     Raises:
         RunError: `out` holds a run with another config, or a damaged one.
         ValueError: another run is writing there, or `out` holds files that no run wrote.
-        FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is not, and the last
-            checkpoint was kept.
+        FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is
+            not, and the last checkpoint was kept.
     """
     with join_processes() as own, _claim(out) if own.first else nullcontext():
         run = Run(config, out, start, own)
@@ -258,7 +260,8 @@ class Run:
                 and self.validation is not None
                 and (self.keeps_best or self.objective.compares_seen)
             ):
-                # The weights that the run starts from are kept if none are better, and later gains are over theirs.
+                # The weights that the run starts from are kept if none are better, and later gains
+                # are over theirs.
                 self._validate(log, step)
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)

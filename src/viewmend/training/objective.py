@@ -45,8 +45,8 @@ class ImageLoss:
     outside: Float[Tensor, ""]
     """L_out of section 8: L1 outside the holes."""
     log_error: Float[Tensor, ""]
-    """log10 of the mean squared error in the holes, a tenth of -PSNR. Where a pixel may be subject or background, L1
-    settles for one of the two; squares do not."""
+    """log10 of the mean squared error in the holes, a tenth of -PSNR. Where a pixel may be subject
+    or background, L1 settles for one of the two; squares do not."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class StepOutput:
 
 
 Validation = Callable[[nn.Module, Path], dict[str, float | None]]
-"""From the averaged model to its mean scores in dB, on fixed views that a run never trains on; writes an image of the
-first views to the path."""
+"""From the averaged model to its mean scores in dB, on fixed views that a run never trains on;
+writes an image of the first views to the path."""
 
 
 class Objective(nn.Module, Generic[Model]):
@@ -76,7 +76,8 @@ class Objective(nn.Module, Generic[Model]):
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
     compares_seen = False
-    """Whether the validation also scores views that the run trains on, beginning with the weights it starts from."""
+    """Whether the validation also scores views that the run trains on, beginning with the weights
+    it starts from."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()
@@ -117,8 +118,8 @@ class Objective(nn.Module, Generic[Model]):
 def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", optional: str = "") -> None:
     """Copy the weights of a model to start from, if there is one.
 
-    The model keeps its own weights with the prefix `kept`, and `start` may lack those with the prefix `optional`.
-    Raises ValueError if it lacks others, or has them in other sizes.
+    The model keeps its own weights with the prefix `kept`, and `start` may lack those with the
+    prefix `optional`. Raises ValueError if it lacks others, or has them in other sizes.
     """
     if start is None:
         return
@@ -148,8 +149,8 @@ def image_loss(
 ) -> ImageLoss:
     """The mean losses of a batch of images of any sizes: of Ftilde, given E, and F* on the same background.
 
-    L_out includes pixels where `counted` is above 0. L_in and L_out take the mean over the `channels` or, as in the
-    paper, the sum.
+    L_out includes pixels where `counted` is above 0. L_in and L_out take the mean over the
+    `channels` or, as in the paper, the sum.
     """
     losses = []
     for image, included, E, target in zip(predicted, counted, error, truth, strict=True):
@@ -189,8 +190,9 @@ def write_rows(rows: Images, path: Path) -> None:
 class HoleValidation:
     """PSNR in the holes of fixed views, of the model ("holes") and of OpenCV's Telea ("telea").
 
-    With `seen`, the scenes that the run trains on, as many views of these are scored as well ("holes_seen" and
-    "telea_seen"): a model that memorises its samples gains more on them. The views are made at the first validation.
+    With `seen`, the scenes that the run trains on, as many views of these are scored as well
+    ("holes_seen" and "telea_seen"): a model that memorises its samples gains more on them. The
+    views are made at the first validation.
     """
 
     scenes: SceneSource[Sample]

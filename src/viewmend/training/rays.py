@@ -1,7 +1,7 @@
 """Training of the ray fill, `rays`, alone: on pixels whose rays are sampled once, and stored instead of their views.
 
-A batch of rays takes a hundredth of a sample's size and holds most of a step's work, so a buffer or a folder of shards
-covers thousands of scenes.
+A batch of rays takes a hundredth of a sample's size and holds most of a step's work, so a buffer or
+a folder of shards covers thousands of scenes.
 """
 
 from collections.abc import Sequence

@@ -29,7 +29,8 @@ SMALL_RIGS = SceneConfig(
 SUBJECT_SCENES = SceneConfig(
     sizes_px=(224, 320, 416, 576), num_holdout_views=5, imperfect_fraction=0.8, hard_fraction=0.5
 )
-"""Of `views` and `rays`. Each image size is at most 1.5 times the one before, so subjects of all sizes occur."""
+"""Of `views` and `rays`. Each image size is at most 1.5 times the one before, so subjects of all
+sizes occur."""
 CAPTURE_SIZES_PX = (320, 576, 832)
 """Image sizes of fine-tuning, up to those of real cameras."""
 
@@ -87,8 +88,8 @@ def paper() -> TrainConfig:
 def paper_small() -> TrainConfig:
     """The paper's model and objective at smaller widths; for two CPU cores.
 
-    Rigs are as large as the paper's, and each sample is seen once. Nine scenes of ten have no past frames: a whole
-    window takes eight times as long.
+    Rigs are as large as the paper's, and each sample is seen once. Nine scenes of ten have no past
+    frames: a whole window takes eight times as long.
     """
     sampling = replace(PaperObjectiveConfig().sampling, window_fraction=0.1, min_hole_px=100)
     return TrainConfig(

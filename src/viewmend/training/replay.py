@@ -35,7 +35,8 @@ class ReplayPosition:
 class SampleReplay(Generic[Item]):
     """A stream of batches: new samples, and others from a buffer of recent ones.
 
-    Worker processes make scenes ahead of time; they are used in the order of their numbers, whichever worker made them.
+    Worker processes make scenes ahead of time; they are used in the order of their numbers,
+    whichever worker made them.
     """
 
     def __init__(
@@ -115,8 +116,8 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
             collate_fn=_to_bytes,
             worker_init_fn=_ignore_signals,
         )
-        # Forked workers must not collect what this process left behind: a decoder, say, would wait for its threads,
-        # which exist here only.
+        # Forked workers must not collect what this process left behind: a decoder, say, would wait
+        # for its threads, which exist here only.
         gc.collect()
         gc.freeze()
         try:

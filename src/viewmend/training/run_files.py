@@ -60,7 +60,8 @@ class Progress:
     """Fraction of the run that was done before this step, in [0, 1]."""
     learning_rate: float
     losses: dict[str, float]
-    """Losses by name: inside (L_in), outside (L_out), total, adversarial (L_adv), discriminator; streams averaged."""
+    """Losses by name: inside (L_in), outside (L_out), total, adversarial (L_adv), discriminator;
+    streams averaged."""
     elapsed_s: float
     samples_per_s: float
     waiting: float

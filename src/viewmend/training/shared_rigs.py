@@ -56,8 +56,8 @@ class SharedRigScenes:
         """`seed` determines everything random except the people, whose seeds belong to the split.
 
         Raises:
-            ValueError: the split is test, the config's characters or motions are reserved for tests, or the samples are
-                clips, or have cameras besides the source views.
+            ValueError: the split is test, the config's characters or motions are reserved for
+                tests, or the samples are clips, or have cameras besides the source views.
         """
         if sampling.clip_length != 1 or sampling.num_ray_views or sampling.min_context_views:
             raise ValueError("expected samples of one view with its source views, got clips or more cameras")

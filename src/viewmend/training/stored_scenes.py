@@ -1,7 +1,8 @@
 """Compact scenes on disk: one frame of a rig, and for each held-out camera the hull of the others and its ground truth.
 
-A training view takes some ten megabytes, most of which follows from the images and a hull. Only these are stored, and
-views are rendered when the scene is read: all views share the images, and each reading may render differently.
+A training view takes some ten megabytes, most of which follows from the images and a hull. Only
+these are stored, and views are rendered when the scene is read: all views share the images, and
+each reading may render differently.
 """
 
 from dataclasses import dataclass, replace
@@ -93,8 +94,8 @@ class StoredScene:
     ) -> Sample:
         """The sample of held-out view `number`, with this number of cameras near it.
 
-        With `errors`, and true depth, it is rendered from depth maps with such errors instead of the hull. Raises
-        ValueError if the stored scene is damaged.
+        With `errors`, and true depth, it is rendered from depth maps with such errors instead of
+        the hull. Raises ValueError if the stored scene is damaged.
         """
         if number >= len(self.held):
             raise ValueError(
@@ -140,9 +141,9 @@ def _check(frame: MultiViewFrame, cameras: Cameras) -> None:
 def store_scene(scene: Scene, config: SceneConfig, depth_model: Inpainter | None = None) -> StoredScene:
     """The first frame of a rig, with some of its cameras held out.
 
-    With a model that predicts depth, the geometry of `fused_fraction` of the scenes is fused, which takes seconds:
-    their cameras are held out together, `HELD_FRACTION` of the rig, and share it. In other scenes they are held out in
-    turn, each behind the hull of all the others.
+    With a model that predicts depth, the geometry of `fused_fraction` of the scenes is fused, which
+    takes seconds: their cameras are held out together, `HELD_FRACTION` of the rig, and share it. In
+    other scenes they are held out in turn, each behind the hull of all the others.
     """
     rig = scene.rig
     time = min(scene.rig.frames)

@@ -1,7 +1,8 @@
 """Training of the default model, `views`: its options, its views, its loss and its validation.
 
-Colours give three labels per pixel. The studio also knows which sample along the ray is the surface, which cameras see
-it, and how much of the pixel the subject covers. Captures have no true depth; their views skip the terms that need it.
+Colours give three labels per pixel. The studio also knows which sample along the ray is the
+surface, which cameras see it, and how much of the pixel the subject covers. Captures have no true
+depth; their views skip the terms that need it.
 """
 
 import math
@@ -63,9 +64,11 @@ SMOOTH_GUESS = 0.3
 MIN_GAIN = 0.6
 """Smallest factor by which changed colours are darkened."""
 WRONG = 0.08
-"""Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when crops are drawn."""
+"""Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when
+crops are drawn."""
 CORRECT = 0.1
-"""Largest difference of a channel with which a pixel counts as correct for confidence and error prediction."""
+"""Largest difference of a channel with which a pixel counts as correct for confidence and error
+prediction."""
 RIGHT = 0.05
 """A rendered pixel is right if no channel, in [0, 1], differs from the truth by more than this."""
 DAMAGED = 0.08
@@ -445,9 +448,9 @@ def _masked_mean(values: Float[Tensor, "cell"], where: Bool[Tensor, "cell"]) -> 
 class ViewsValidation:
     """Views of procedural people that training never uses, made at the first validation.
 
-    The scores are PSNR in the subject's box, on black: as rendered, with all pixels predicted ("completed"), the same
-    on the true silhouette ("subject") and in holes ("holes"), and with only the `REFINED_FRACTION` of highest predicted
-    gain ("refined").
+    The scores are PSNR in the subject's box, on black: as rendered, with all pixels predicted
+    ("completed"), the same on the true silhouette ("subject") and in holes ("holes"), and with only
+    the `REFINED_FRACTION` of highest predicted gain ("refined").
     """
 
     config: TrainConfig

@@ -56,8 +56,8 @@ def name_path_in_errors(path: Path) -> Iterator[None]:
 def write_atomically(path: Path, write: Callable[[Path], object], durable: bool = False) -> None:
     """Call `write` with a temporary path, then rename it to `path`: readers never see a partial file.
 
-    With `durable`, the data is flushed to disk before the rename, so that a power failure leaves the old or the new
-    file.
+    With `durable`, the data is flushed to disk before the rename, so that a power failure leaves
+    the old or the new file.
 
     Raises:
         OSError: writing failed, with the path; an existing file at `path` is unchanged.

@@ -14,8 +14,8 @@ import numba
 def kernel(function: Any = None, *, cache: bool = True, **options: Any) -> Any:
     """Decorator that compiles a function, which then releases the GIL. `options` are those of `numba.njit`.
 
-    A run-time type checker's wrapper is removed. The result is cached next to the source or in the user's cache, else
-    in a private folder for temporary files, else not at all.
+    A run-time type checker's wrapper is removed. The result is cached next to the source or in the
+    user's cache, else in a private folder for temporary files, else not at all.
     """
     if function is None:
         return lambda function: kernel(function, cache=cache, **options)

@@ -21,12 +21,14 @@ MIN_GROWTH_BYTES = 10e6
 TOP_BYTES = 50_000_000
 """Free memory at the end of the heap that glibc keeps, as it is soon used again."""
 ARENAS = 1
-"""Heaps of glibc. By default there are eight per core, each with its own free memory; here one thread renders."""
+"""Heaps of glibc. By default there are eight per core, each with its own free memory; here one
+thread renders."""
 LARGE_BYTES = 8_000_000
-"""Larger buffers are mapped separately and unmapped after use; no moving view needs one. By default, glibc raises this
-threshold up to 32 MB."""
+"""Larger buffers are mapped separately and unmapped after use; no moving view needs one. By
+default, glibc raises this threshold up to 32 MB."""
 KERNELS = 64
-"""Compiled convolutions that oneDNN keeps, each for one size of image. By default 1024, which fill 150 MB and more."""
+"""Compiled convolutions that oneDNN keeps, each for one size of image. By default 1024, which fill
+150 MB and more."""
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
 _M_ARENA_MAX = -8

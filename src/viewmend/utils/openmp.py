@@ -1,7 +1,8 @@
 """Let the idle threads of PyTorch's OpenMP pool sleep, so that other programs do not slow this one down.
 
-By default, threads of GCC's OpenMP library spin for milliseconds whenever they wait. If another program uses a core,
-the threads that have a core spin for the one that has none, and a network takes up to twelve times as long.
+By default, threads of GCC's OpenMP library spin for milliseconds whenever they wait. If another
+program uses a core, the threads that have a core spin for the one that has none, and a network
+takes up to twelve times as long.
 """
 
 import os
@@ -12,15 +13,17 @@ POLICY = "OMP_WAIT_POLICY"
 """The environment variable that OpenMP libraries read when they are loaded."""
 
 CHOICES = (POLICY, "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
-"""The environment variables by which a user decides how long idle threads spin; we change nothing if one is set."""
+"""The environment variables by which a user decides how long idle threads spin; we change nothing
+if one is set."""
 
 
 def let_idle_threads_sleep() -> None:
     """Make idle OpenMP threads sleep in this process and in those that it starts; called by `import viewmend`.
 
-    The environment variable is enough if torch has not been imported yet. Otherwise its OpenMP library has already read
-    the environment. GCC's library then spins briefly only while it manages more threads than there are cores
-    (GOMP_SPINCOUNT in its manual), so a pool of threads that sleeps until the process ends brings it to that.
+    The environment variable is enough if torch has not been imported yet. Otherwise its OpenMP
+    library has already read the environment. GCC's library then spins briefly only while it manages
+    more threads than there are cores (GOMP_SPINCOUNT in its manual), so a pool of threads that
+    sleeps until the process ends brings it to that.
     """
     if any(name in os.environ for name in CHOICES):
         return

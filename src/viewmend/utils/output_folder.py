@@ -30,8 +30,9 @@ class _Manifest(msgspec.Struct):
 class OutputFolder:
     """Context manager: a folder that only this run writes to.
 
-    A manifest lists the files that runs created, with their hashes. A file that is in the way and not listed, or was
-    changed since, belongs to the user: the run refuses to overwrite it. Leftovers of killed runs are removed on entry.
+    A manifest lists the files that runs created, with their hashes. A file that is in the way and
+    not listed, or was changed since, belongs to the user: the run refuses to overwrite it.
+    Leftovers of killed runs are removed on entry.
     """
 
     def __init__(self, path: Path) -> None:

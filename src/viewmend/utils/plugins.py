@@ -19,7 +19,8 @@ def import_object(name: str) -> Any:
 def load_from_file(name: str) -> Callable[..., object]:
     """Import NAME from FILE.py:NAME, a class or a function.
 
-    The module name contains the file's hash, so that a changed file is imported again; an unchanged file is not.
+    The module name contains the file's hash, so that a changed file is imported again; an
+    unchanged file is not.
 
     Raises:
         ValueError: there is no such file, or it has no callable of that name.

@@ -1,7 +1,7 @@
 """Reads numbers, strings, lists, dicts and arrays from pickles and from NumPy's object files.
 
-Python's unpickler runs with stand-ins for the few functions that arrays and numbers need. Nothing is imported, and no
-other function is called: any other name is rejected.
+Python's unpickler runs with stand-ins for the few functions that arrays and numbers need. Nothing
+is imported, and no other function is called: any other name is rejected.
 """
 
 import io

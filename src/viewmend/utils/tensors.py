@@ -1,7 +1,8 @@
 """Tensors in dataclasses and tuples: moved to a device, copied to memory of their own, counted; checks of one tensor.
 
-Long-lived tensors between short-lived ones keep the C library from returning memory: a server that runs for hours
-would occupy several times what it stores. So they are copied to their own memory mappings.
+Long-lived tensors between short-lived ones keep the C library from returning memory: a
+server that runs for hours would occupy several times what it stores. So they are copied to
+their own memory mappings.
 """
 
 import mmap
@@ -24,7 +25,8 @@ class OnDevice:
     """Base class of dataclasses of tensors."""
 
     keeps_host_copy: ClassVar[bool] = False
-    """Whether a copy on another device keeps what it was copied from, because code on the CPU needs its numbers."""
+    """Whether a copy on another device keeps what it was copied from, because code on the CPU needs
+    its numbers."""
 
     def to(self: T, device: torch.device | str) -> T:
         """The same with all tensors on `device`."""

@@ -78,7 +78,8 @@ def read_json(text: str | bytes) -> Any:
     """Parse JSON.
 
     Raises:
-        ValueError: the text is not JSON, or has more than `MOST_PARTS` lists and objects, which takes too long.
+        ValueError: the text is not JSON, or has more than `MOST_PARTS` lists and objects, which
+            takes too long.
     """
     opening = (b"[", b"{") if isinstance(text, bytes) else ("[", "{")
     if (parts := sum(map(text.count, opening))) > MOST_PARTS:  # pyright: ignore[reportArgumentType]
@@ -98,7 +99,8 @@ def typed(
 
     Args:
         value: a result of `read_json`.
-        kind: a msgspec.Struct, or any other type that msgspec takes. Its `__post_init__` may raise a ValueError.
+        kind: a msgspec.Struct, or any other type that msgspec takes. Its `__post_init__`
+            may raise a ValueError.
         next_step: end of the message, unless the error has its own.
         strict: False accepts strings for numbers, as in a URL query.
 

@@ -39,8 +39,8 @@ class FocalAttention(nn.Module):
         self.heads = heads
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
-        # Tokens of the four rolled windows, one after the other, that lie outside of the own window: of the middle one
-        # of nine windows, whose rolled windows do not wrap around.
+        # Tokens of the four rolled windows, one after the other, that lie outside of the own
+        # window: of the middle one of nine windows, whose rolled windows do not wrap around.
         own, rolled = window_places((3, 3))
         self.register_buffer("valid_ind_rolled", torch.nonzero(~torch.isin(rolled[4], own[4]))[:, 0])
 

@@ -206,8 +206,8 @@ class Propagation(nn.Module):
     ) -> Float[Tensor, "sample frame channel height width"]:
         """Features of consecutive frames, given the flow of each pair, (right, down) in their pixels."""
         frames = features.unbind(1)
-        # The flows are in the order of time although this sweep starts at the last pair: the published weights were
-        # trained this way.
+        # The flows are in the order of time although this sweep starts at the last pair: the
+        # published weights were trained this way.
         backward = self._sweep("backward_", [(x,) for x in reversed(frames)], to_next.unbind(1))
         known = list(zip(frames, reversed(backward), strict=True))
         forward = self._sweep("forward_", known, to_previous.unbind(1))

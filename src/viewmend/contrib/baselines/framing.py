@@ -61,9 +61,9 @@ def windows_over(
 ) -> tuple[Window, ...]:
     """The windows of a grid that are needed for the holes.
 
-    The grid has the fewest evenly spaced windows that cover the canvas with at least this overlap. It depends on sizes
-    alone, so a stream has the same windows at each time. The middles of overlaps divide the canvas among the windows;
-    a window is needed if its part has a hole.
+    The grid has the fewest evenly spaced windows that cover the canvas with at least this overlap.
+    It depends on sizes alone, so a stream has the same windows at each time. The middles of
+    overlaps divide the canvas among the windows; a window is needed if its part has a hole.
     """
     rows, cols = (_grid(length, side, overlap_px) for length, side in zip(holes.shape, size, strict=True))
     return tuple(

@@ -154,8 +154,8 @@ class SoftSplit(nn.Module):
 class SoftComposition(nn.Module):
     """Patches from tokens, added up where they overlap.
 
-    Keys: `embedding`; FuseFormer and E2FGVI add a learned map `bias` that fixes the size, `bias_size`; E2FGVI-HQ runs
-    a convolution `bias_conv` instead; DSTT does neither.
+    Keys: `embedding`; FuseFormer and E2FGVI add a learned map `bias` that fixes the size,
+    `bias_size`; E2FGVI-HQ runs a convolution `bias_conv` instead; DSTT does neither.
     """
 
     def __init__(self, bias_size: tuple[int, int] | None = None, bias_convolution: bool = False) -> None:
@@ -175,8 +175,8 @@ class SoftComposition(nn.Module):
 class FusionFeedForward(nn.Module):
     """Feed-forward whose hidden patches are averaged where they overlap; keys `conv1.0` and `conv2.<last>`.
 
-    `between` are the layers before the second linear layer, whose number is in its key: FuseFormer has a ReLU and an
-    (inactive) dropout, `conv2.2`; E2FGVI has a GELU, `conv2.1`.
+    `between` are the layers before the second linear layer, whose number is in its key: FuseFormer
+    has a ReLU and an (inactive) dropout, `conv2.2`; E2FGVI has a GELU, `conv2.1`.
     """
 
     def __init__(self, *between: nn.Module) -> None:

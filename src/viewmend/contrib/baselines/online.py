@@ -65,8 +65,8 @@ class Sampling:
     step: int = 10
     """Frames between references."""
     grid: Literal["absolute", "relative"] = "absolute"
-    """References are the latest multiples of `step` (as Thiry et al. do), or `step`, 2 `step`, ... frames back (as the
-    paper on multi-view inpainting writes)."""
+    """References are the latest multiples of `step` (as Thiry et al. do), or `step`, 2 `step`, ...
+    frames back (as the paper on multi-view inpainting writes)."""
 
     def neighbour_times(self, time: int) -> tuple[int, ...]:
         """The times just before `time`, latest first, none before 0."""
@@ -97,8 +97,8 @@ class OnlineConfig:
     """How a published network is run on a stream."""
 
     framing: Literal["def", "win", "mul"] = "def"
-    """The whole view resized to the network's size; overlapping windows in the view's own resolution; or windows, and
-    the source cameras of the view next to it in each frame."""
+    """The whole view resized to the network's size; overlapping windows in the view's own
+    resolution; or windows, and the source cameras of the view next to it in each frame."""
     sampling: Sampling = field(default_factory=Sampling)
     """Which past times are input."""
     size_px: tuple[int, int] = (240, 432)

@@ -1,8 +1,9 @@
 """Published networks by name, with weights of their authors or of our training.
 
-`NETWORK-o-FRAMING`: a network of `NETWORKS`; o for online; def, win or mul (`OnlineConfig.framing`). Then, optionally,
-`-relative` (`Sampling.grid`). The weights are the authors'; with `-finetuned` those that our training wrote to
-`finetuned/NETWORK/`, with `@PATH` those of a run's folder, or of a file.
+`NETWORK-o-FRAMING`: a network of `NETWORKS`; o for online; def, win or mul
+(`OnlineConfig.framing`). Then, optionally, `-relative` (`Sampling.grid`). The weights are the
+authors'; with `-finetuned` those that our training wrote to `finetuned/NETWORK/`, with `@PATH`
+those of a run's folder, or of a file.
 """
 
 import re

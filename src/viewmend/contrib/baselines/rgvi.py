@@ -1,8 +1,9 @@
 """RGVI (Cho et al. 2025), reference-guided video inpainting, as the offline upper bound of the paper.
 
-It pulls pixels of the past along optical flow into the holes. As in the paper, past frames are the true images and only
-the newest frame has holes, so there is one direction to pull from. Flow is torchvision's RAFT (Teed & Deng 2020) where
-its weights are available, otherwise OpenCV's. The smooth fill completes the flow, and what no past frame shows.
+It pulls pixels of the past along optical flow into the holes. As in the paper, past frames are the
+true images and only the newest frame has holes, so there is one direction to pull from. Flow is
+torchvision's RAFT (Teed & Deng 2020) where its weights are available, otherwise OpenCV's. The
+smooth fill completes the flow, and what no past frame shows.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,8 @@ Image = Float[Tensor, "3 height width"]
 FlowMap = Float[Tensor, "2 height width"]
 """Where each pixel's point is in another image, relative to the pixel: x right, y down, pixels."""
 DISAGREEMENT = (0.01, 0.5)
-"""Forward and backward flow may differ, squared, by this fraction of their squares plus this many square pixels."""
+"""Forward and backward flow may differ, squared, by this fraction of their squares plus this many
+square pixels."""
 
 
 def dis_flow(image: Image, other: Image) -> FlowMap:

@@ -1,7 +1,7 @@
 """DSTT and FuseFormer: frames to tokens, blocks of attention, tokens to frames.
 
-DSTT: Liu et al. 2021, "Decoupled Spatial-Temporal Transformer for Video Inpainting". FuseFormer: Liu et al. 2021,
-"Fusing Fine-Grained Information in Transformers for Video Inpainting".
+DSTT: Liu et al. 2021, "Decoupled Spatial-Temporal Transformer for Video Inpainting". FuseFormer:
+Liu et al. 2021, "Fusing Fine-Grained Information in Transformers for Video Inpainting".
 """
 
 from abc import ABC, abstractmethod

@@ -1,7 +1,7 @@
 """Training of the published baselines on our samples, with their authors' losses and parameters.
 
-Clips are framed as `OnlineInpainter` frames a stream: the whole view resized ("def"), or a window around holes without
-("win") or with ("mul") images of other cameras.
+Clips are framed as `OnlineInpainter` frames a stream: the whole view resized ("def"), or a window
+around holes without ("win") or with ("mul") images of other cameras.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,8 @@ CLIP_LENGTH = 5
 FULL_RATE = 0.8
 """Fraction of a run at the full learning rate; the rest is at a tenth of it, as in the authors' training."""
 ADVERSARIAL, DISCRIMINATOR_RATE = 0.01, 1e-4
-"""Weight of the hinge loss of T-PatchGAN, and the discriminator's learning rate, as in the authors' training."""
+"""Weight of the hinge loss of T-PatchGAN, and the discriminator's learning rate, as in the
+authors' training."""
 SAMPLING = SamplingConfig(
     frames=(0, *range(10, 10 + CLIP_LENGTH)), clip_length=CLIP_LENGTH, num_target_frames=3, with_context=True
 )
@@ -83,7 +84,8 @@ def training_clip(
         sample: with the samples before it.
         size_px: height and width of the network's frames.
         framing: how the clip is cut from the views.
-        background: background of views and ground truth; images of other cameras are on black, as on a stream.
+        background: background of views and ground truth; images of other cameras are on
+            black, as on a stream.
         length: number of views, as far as there are samples before.
     """
     samples = sample.clip[-length:]
@@ -115,8 +117,8 @@ def training_clip(
 class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
     """L1 in the holes plus L1 outside of them, each over its own pixels, and the hinge loss on completed clips.
 
-    E2FGVI also has L1 of its completed flows against those of the true frames by a fixed SPyNet: the starting model's,
-    so this term is left out without a starting model.
+    E2FGVI also has L1 of its completed flows against those of the true frames by a fixed SPyNet:
+    the starting model's, so this term is left out without a starting model.
     """
 
     loss_summary = f"L1 inside and outside the holes, {ADVERSARIAL:g} x hinge loss of T-PatchGAN"
@@ -273,8 +275,8 @@ def flow_term(flows: LocalFlows, true: LocalFlows) -> Float[Tensor, ""]:
 def _initialise(network: TokenTransformer | E2FGVI) -> None:
     """Draw the convolutions of encoder and decoder, except for the last, by their fan-in (He et al. 2015).
 
-    With the authors' N(0, 0.02) and frames that are mostly black, outputs become black within tens of steps, where tanh
-    has no slope, and stay so for hundreds.
+    With the authors' N(0, 0.02) and frames that are mostly black, outputs become black within tens
+    of steps, where tanh has no slope, and stay so for hundreds.
     """
     parts = [child for name, child in network.named_children() if name in ("encoder", "hier_enc", "decoder")]
     convolutions = [m for part in parts for m in part.modules() if isinstance(m, nn.Conv2d)]

@@ -51,8 +51,9 @@ class Tick:
 class Aligner:
     """Groups images by tick. One thread at a time may call it.
 
-    Ticks are evenly spaced and follow the cameras' own rate and phase. A tick is complete when each camera has an image
-    for it or a later one; absent cameras do not count. An incomplete tick waits for `wait_s`.
+    Ticks are evenly spaced and follow the cameras' own rate and phase. A tick is complete
+    when each camera has an image for it or a later one; absent cameras do not count. An
+    incomplete tick waits for `wait_s`.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:

@@ -56,8 +56,8 @@ class Playback:
         self.length_s = length_s
         """All recordings start again after these seconds: at the end of the shortest."""
         self.shifts_s: dict[str, float] = {}
-        """Added to the times in each recording, so that the earliest one starts at 0. A camera that is not listed here
-        starts at 0 by itself."""
+        """Added to the times in each recording, so that the earliest one starts at 0. A camera that
+        is not listed here starts at 0 by itself."""
 
     def follow(self, tracks: Sequence[Track]) -> None:
         """Play these recordings by their own times.
@@ -84,7 +84,8 @@ def read_pictures(
 ) -> Generator[Picture, None, None]:
     """Generate the images of a camera from now on, until it fails; close the generator after use.
 
-    Damaged ("torn") and "duplicated" images are counted in `counts`. `wait(seconds)` is True once none are wanted.
+    Damaged ("torn") and "duplicated" images are counted in `counts`. `wait(seconds)` is True once
+    none are wanted.
 
     Raises:
         OSError: it cannot be opened, ends, or is silent.

@@ -12,9 +12,11 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 MAX_DRIVER_DELAY_S = 1.0
-"""A driver's timestamp is on a clock of this machine if it lies at most this many seconds before the arrival."""
+"""A driver's timestamp is on a clock of this machine if it lies at most this many seconds before
+the arrival."""
 LAG_PACKETS = {"rtsp": 1, "rtp": 1, "mpegts": 2}
-"""FFmpeg delays images by these numbers of packets: its parsers detect an image's end by the next one's start."""
+"""FFmpeg delays images by these numbers of packets: its parsers detect an image's end by the next
+one's start."""
 UNTIMED_FORMATS = ("mjpeg", "mpjpeg", "h264", "hevc", "rawvideo", "image2pipe", "jpeg_pipe")
 """These formats of FFmpeg have no meaningful timestamps."""
 

@@ -71,8 +71,8 @@ def connect(ray: Any, address: str, **own: object) -> None:
 def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Runs:
     """The results of all tasks as they finish; each task runs on one core, or on one GPU.
 
-    Machines of the cluster need this package, and captures, people and models at the same paths. A task whose process
-    dies fails alone.
+    Machines of the cluster need this package, and captures, people and models at the same paths. A
+    task whose process dies fails alone.
 
     Raises:
         ValueError: Ray is not installed, or there is no cluster at the address.

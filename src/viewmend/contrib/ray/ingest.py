@@ -18,7 +18,8 @@ from viewmend.types import MultiViewFrame
 from viewmend.utils.heap import HeapTrimmer
 
 LEAD_S = 2.0
-"""The frames of the edge are prepared for this many seconds after a process reported that the edge is watched."""
+"""The frames of the edge are prepared for this many seconds after a process reported that the edge
+is watched."""
 LEAD_TICK_S = 0.005
 """The edge is checked at this interval, in seconds, while it is watched."""
 
@@ -37,7 +38,8 @@ class SourceState:
     span: Span
     rig: RigInfo | None
     edge: float
-    """Position of the viewers that follow the edge: while it is watched, the last frame that was prepared for them."""
+    """Position of the viewers that follow the edge: while it is watched, the last frame that was
+    prepared for them."""
     spread_ms: float | None
     camera_counts: dict[str, dict[str, int]]
 
@@ -75,8 +77,8 @@ class PreparedFrame:
 class Ingest:
     """Reads a source for other processes. Any number of threads may call it.
 
-    All viewers that follow the edge get the same frames: a thread prepares them one after the other, each time the one
-    that is the edge at that moment.
+    All viewers that follow the edge get the same frames: a thread prepares them one after the
+    other, each time the one that is the edge at that moment.
     """
 
     def __init__(

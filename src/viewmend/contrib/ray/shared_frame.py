@@ -24,14 +24,15 @@ from viewmend.utils.tensors import size_bytes
 class SharedFrame:
     """A frame and everything that is computed from it whatever the view.
 
-    It is pickled as a few hundred bytes and out-of-band arrays (pickle protocol 5). If these are kept in shared memory,
-    as in Ray's object store, the tensors of all processes lie there, read-only.
+    It is pickled as a few hundred bytes and out-of-band arrays (pickle protocol 5). If
+    these are kept in shared memory, as in Ray's object store, the tensors of all processes
+    lie there, read-only.
     """
 
     frame: MultiViewFrame
     cached: CachedFrame | None
-    """The frame with its hull, its depth in each camera, and the inpainter's encodings; None if no hull can be carved,
-    in which case the renderer raises the reason again."""
+    """The frame with its hull, its depth in each camera, and the inpainter's encodings; None if no
+    hull can be carved, in which case the renderer raises the reason again."""
 
     @classmethod
     def prepare(

@@ -19,12 +19,13 @@ from viewmend.types import MultiViewFrame
 LONGEST_PX = 256
 """Images are compared at no more than this many pixels along their longer side."""
 BLANK_PX = 128
-"""Blank images are looked for in every n-th pixel, so that at least this many remain along the longer side."""
+"""Blank images are looked for in every n-th pixel, so that at least this many remain along the
+longer side."""
 HULL = HullConfig(resolution=64)
 """Hulls have this resolution."""
 SUSPECT = 1.25
-"""Changed images are tried for a camera whose distance is more than this many times the median: mirrored, rotated, BGR,
-and those of other cameras."""
+"""Changed images are tried for a camera whose distance is more than this many times the median:
+mirrored, rotated, BGR, and those of other cameras."""
 FITS = 0.65
 """A changed image explains the fault if its distance is below this share of the original's."""
 PALE = 0.4
@@ -45,8 +46,8 @@ NOISY = 2.0
 class OtherSubjectRule:
     """The rule by which an image shows something other than the images of the other cameras.
 
-    The distance is the difference in colour to the others. Where colours agree to 2 %, shadows and noise alone make it
-    three times as large, hence `min_distance`.
+    The distance is the difference in colour to the others. Where colours agree to 2 %, shadows and
+    noise alone make it three times as large, hence `min_distance`.
     """
 
     min_distance: float = 0.09

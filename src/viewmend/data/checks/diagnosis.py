@@ -52,8 +52,8 @@ TURNED = {"mirrored": (1,), "upside down": (0,), "rotated by 180 degrees": (0, 1
 def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue, ...]:
     """Find the faults of one frame; empty for a good frame and for one without masks.
 
-    If hull and masks disagree, common mistakes are undone one at a time, and the issue names the change that makes
-    them agree. A good frame costs one hull and a small one per camera.
+    If hull and masks disagree, common mistakes are undone one at a time, and the issue names the
+    change that makes them agree. A good frame costs one hull and a small one per camera.
     """
     frame = limit_size(frame, LONGEST_PX)
     if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > FOREGROUND).any()):
@@ -91,9 +91,9 @@ def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, 
 def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> tuple[Issue, ...]:
     """Find masks that are inverted, or empty although the other input cameras see the subject there.
 
-    Returns one issue per camera, or a single fatal one if at least half of the masks are inverted. A camera that is not
-    an input is judged by its own mask alone and is not left out, since results are scored against it; it does not
-    affect the judgement of other cameras.
+    Returns one issue per camera, or a single fatal one if at least half of the masks are inverted.
+    A camera that is not an input is judged by its own mask alone and is not left out, since results
+    are scored against it; it does not affect the judgement of other cameras.
     """
     if frame.mask is None:
         return ()

@@ -39,9 +39,11 @@ MAX_OUTLINE_POINTS = 400
 BOX_MARGIN = 1.5
 """The search box is this many times as large as that of the hull, which a faulty camera makes too small."""
 MIN_OUTLINE_CAMERAS = 5
-"""Outlines are compared in rigs of at least this many cameras: the rest of smaller rigs always agrees too well."""
+"""Outlines are compared in rigs of at least this many cameras: the rest of smaller rigs always
+agrees too well."""
 WORST_POINTS = 0.01
-"""This share of the points, the worst ones, is not counted: single points miss thin parts in clean rigs, too."""
+"""This share of the points, the worst ones, is not counted: single points miss thin parts
+in clean rigs, too."""
 MIN_RESIDUAL_PX = 0.16
 """Outlines with a smaller residual, pixels, agree; clean rigs of 8 to 20 cameras stay below it."""
 RESOLUTION_PX = 0.01
@@ -89,7 +91,8 @@ class RoughRigThresholds:
     max_left: float = 0.67
     """A suspect may be the outlier if at most this share of the residual remains without it."""
     min_left_of_others: float = 1.25
-    """Leaving out any other suspect must leave at least this many times the residual that remains without it."""
+    """Leaving out any other suspect must leave at least this many times the residual that remains
+    without it."""
 
 
 @dataclass(frozen=True)
@@ -225,9 +228,10 @@ def find_outlier_by_outlines(
 ) -> tuple[tuple[str, ...], float] | None:
     """Find the camera that keeps the outlines from agreeing, and how many times smaller the residual is without it.
 
-    The line of sight through a point of an outline touches the subject, so one of its points lies inside all other
-    masks. The residual is how far outside the best point is. This detects pose errors of a few pixels. Two cameras are
-    named if it may be either; None if no camera is an outlier.
+    The line of sight through a point of an outline touches the subject, so one of its
+    points lies inside all other masks. The residual is how far outside the best point is.
+    This detects pose errors of a few pixels. Two cameras are named if it may be either;
+    None if no camera is an outlier.
     """
     names = frame.cameras.names
     small = limit_size(frame, OUTLINE_LONGEST_PX)

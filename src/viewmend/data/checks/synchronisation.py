@@ -26,16 +26,19 @@ from viewmend.types import MultiViewFrame
 MAX_DELAY = 4
 """Largest delay that is searched, in frames."""
 MIN_DELAY_GAIN = 0.008
-"""A camera may be delayed if the share of its mask outside the others' hull is this much lower in another frame."""
+"""A camera may be delayed if the share of its mask outside the others' hull is this much lower in
+another frame."""
 MAX_DELAY_CANDIDATES = 3
 """The camera opposite a delayed one looks delayed too, so several are tried."""
 MIN_EXPLAINED = 0.002
-"""A camera is delayed if its mask of another frame lets the hull explain more of all masks, by this share of them."""
+"""A camera is delayed if its mask of another frame lets the hull explain more of all masks, by this
+share of them."""
 MIN_EXPLAINED_SHARE = 0.3
-"""It must also explain this share of what the hull left unexplained: with a calibration that is off, other frames fit
-a little better by chance."""
+"""It must also explain this share of what the hull left unexplained: with a calibration that is
+off, other frames fit a little better by chance."""
 SHARPER = 1.015
-"""Images are delayed if those of another frame have this much stronger edges along the outlines of the masks."""
+"""Images are delayed if those of another frame have this much stronger edges along the
+outlines of the masks."""
 MIN_OUTLINE_FRAMES = 3
 """Edges are compared by the median of this many frames or more, since one frame may be damaged."""
 
@@ -64,7 +67,8 @@ def _frames_around(
 ) -> tuple[list[MultiViewFrame], int]:
     """Frames around a time, of the cameras of `frame` that all of them have, and the position of the one to judge.
 
-    That is the nearest one with as many frames before as after it, if there are enough, and with a subject, if any has.
+    That is the nearest one with as many frames before as after it, if there are enough, and with a
+    subject, if any has.
     """
     count = len(source.frame_ids)
     time = min(max(time, min(MAX_DELAY, count // 2)), max(count - 1 - MAX_DELAY, count // 2))
@@ -89,8 +93,8 @@ def find_desynchronised_camera(
 ) -> tuple[Issue, ...]:
     """Find the camera whose mask of another one of consecutive frames fits the others' of `frames[middle]` best.
 
-    If the masks are in sync, looks for images that are out of sync with their own masks. With `fps`, frames per second,
-    delays are stated in milliseconds too.
+    If the masks are in sync, looks for images that are out of sync with their own masks. With
+    `fps`, frames per second, delays are stated in milliseconds too.
     """
     names = [
         name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)

@@ -1,7 +1,8 @@
 """The capture formats that can be read, and how a folder's format is recognised.
 
-Each format is one module with two functions. `find(folder)` returns the file that identifies the format, or None.
-`content(folder, file)` returns the equivalent content of a `cameras.json` and raises a ValueError for invalid input.
+Each format is one module with two functions. `find(folder)` returns the file that identifies the
+format, or None. `content(folder, file)` returns the equivalent content of a `cameras.json` and
+raises a ValueError for invalid input.
 """
 
 from collections.abc import Callable, Iterable
@@ -103,8 +104,8 @@ def _as_stored(calibration: NativeCalibration) -> NativeCalibration:
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
     """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
 
-    `format` is one of `FORMAT_NAMES`; by default the first one that matches. CaptureError if the format is unknown, the
-    folder does not have it, or its calibration cannot be used.
+    `format` is one of `FORMAT_NAMES`; by default the first one that matches. CaptureError if the
+    format is unknown, the folder does not have it, or its calibration cannot be used.
     """
     if format not in (None, *FORMAT_NAMES):
         raise CaptureError(

@@ -1,7 +1,8 @@
 """Agisoft Metashape's XML export of cameras. Each aligned image is a camera of a single frame.
 
-Photos without a pose of their own are left out with a warning: those that were not aligned, and the secondary cameras
-of multi-camera systems, whose pose Metashape stores relative to the primary camera.
+Photos without a pose of their own are left out with a warning: those that were not aligned,
+and the secondary cameras of multi-camera systems, whose pose Metashape stores relative to
+the primary camera.
 """
 
 from collections import Counter

@@ -1,6 +1,7 @@
 """COLMAP's sparse model, text or binary.
 
-Each image is a camera of a single frame, unless poses and names show that a fixed rig was recorded at several times.
+Each image is a camera of a single frame, unless poses and names show that a fixed rig was recorded
+at several times.
 """
 
 import struct

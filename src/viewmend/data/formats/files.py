@@ -28,7 +28,8 @@ HEADER_BYTES = 2**20
 PLACES = ("videos", "synchronized_videos", "videos-raw", "recordings", "images", "")
 """Folders that are searched for footage; in `recordings` also its only subfolder."""
 MASK_PLACES = ("masks", "mask", "mask_cihp", "schp", "fmask", "rvm", "bgmtv2")
-"""Folders that are searched for masks; the later names are those of segmentation networks and of MVHumanNet."""
+"""Folders that are searched for masks; the later names are those of segmentation networks and of
+MVHumanNet."""
 LABELS = ("mask_cihp", "schp")
 """Folders whose masks are body part labels, of which only 0 is background."""
 NO_SUBJECT = re.compile("background|plate|empty|board|calib|intrinsic")
@@ -237,8 +238,8 @@ class ImageList:
 def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLACES) -> Footage:
     """Find videos, or folders of images, that are named after the cameras; likewise their masks, if any.
 
-    Cameras without footage, such as those of a motion capture system that record markers only, are left out with a
-    warning if two or more cameras have some.
+    Cameras without footage, such as those of a motion capture system that record markers only, are
+    left out with a warning if two or more cameras have some.
 
     Raises:
         ValueError: fewer than two cameras have footage, a camera has several videos, or only some have masks.
@@ -319,8 +320,9 @@ def listed(names: Sequence[str]) -> str:
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """Collect the footage of cameras whose videos or folders of images are known, by name, and find their masks.
 
-    Cameras with one image each show one moment, whatever its name. ValueError for fewer than two cameras, one without
-    footage, masks of only some, and cameras whose frame ids are not the others'.
+    Cameras with one image each show one moment, whatever its name. ValueError for fewer
+    than two cameras, one without footage, masks of only some, and cameras whose frame ids
+    are not the others'.
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
@@ -414,8 +416,8 @@ def _one_moment(
 def _compare_ids(images: dict[str, frozenset[str]], masks: dict[str, frozenset[str]]) -> None:
     """Compare the frame ids of cameras, which have to be equal for images of one moment.
 
-    ValueError if a camera shares fewer than half of its ids with most others, as with each camera's own clock, or its
-    masks with its images.
+    ValueError if a camera shares fewer than half of its ids with most others, as with each camera's
+    own clock, or its masks with its images.
     """
     counts = Counter(frame for found in images.values() for frame in found)
     usual = {frame for frame, count in counts.items() if 2 * count > len(images)}

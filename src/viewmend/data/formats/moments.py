@@ -37,11 +37,13 @@ class PosedImage:
 def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], tuple[str, ...]] | None:
     """The cameras of a fixed rig and the frame ids, if the images show several moments; None if they show one.
 
-    A camera's images have the same pose, or nearly the same one and names that belong together: those in one folder,
-    those that differ only in their last number, or those of one name in several folders.
+    A camera's images have the same pose, or nearly the same one and names that belong together:
+    those in one folder, those that differ only in their last number, or those of one name in
+    several folders.
 
     Raises:
-        ValueError: two images have the same pose, but their names do not tell which images belong to one moment.
+        ValueError: two images have the same pose, but their names do not tell which images belong
+            to one moment.
     """
     groups = _by_pose(images) or _by_name(images)
     if groups is None:

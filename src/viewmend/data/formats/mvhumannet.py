@@ -11,7 +11,8 @@ from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_j
 
 PLACES = ("images", "images_lr")
 CALIBRATED_PX = {120 / 65: (4096, 3000)}
-"""Image size of the calibration by `camera_scale`; other rigs have `OTHER_PX`. Images are usually half as large."""
+"""Image size of the calibration by `camera_scale`; other rigs have `OTHER_PX`. Images are usually
+half as large."""
 OTHER_PX = (2448, 2048)
 MILLIMETRES = 0.001
 

@@ -1,7 +1,7 @@
 """OpenCV's FileStorage files: a reader, and rigs with one file per camera.
 
-The files of a rig are `CAMERA/*.xml`, next to the camera's footage, or `CAMERA.xml` in one folder; likewise YAML. They
-are not parsed by OpenCV, which terminates the process on some invalid files.
+The files of a rig are `CAMERA/*.xml`, next to the camera's footage, or `CAMERA.xml` in one folder;
+likewise YAML. They are not parsed by OpenCV, which terminates the process on some invalid files.
 """
 
 import math
@@ -28,7 +28,8 @@ from viewmend.utils.untrusted_input import bounded_bytes
 MAX_BYTES = 2**20
 """Sixty cameras need 50 kB."""
 LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-"""Keeps numbers as text, so that a camera named 00 keeps its name; libyaml's version is faster, if available."""
+"""Keeps numbers as text, so that a camera named 00 keeps its name; libyaml's version is
+faster, if available."""
 SUFFIXES = (".xml", ".yml", ".yaml")
 KEYS = {
     "K": ("k", "cameramatrix", "intrinsicmatrix", "intrinsics", "mtx"),

@@ -1,6 +1,7 @@
 """RIFTCast data sets (VCI): `calibration.json`, and one folder per frame with images and run-length masks.
 
-RIFTCast is started with a meta file, which names the data set's folder, its frames, and the volume of the subject.
+RIFTCast is started with a meta file, which names the data set's folder, its frames, and the volume
+of the subject.
 """
 
 import re

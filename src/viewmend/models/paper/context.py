@@ -32,7 +32,8 @@ class ContextFrame:
     valid: Bool[Tensor, "patch"]
     """Whether that geometry gives the patch a depth."""
     depths: Float[Tensor, "rows cols"]
-    """z-depth of every patch of the grid, kept or not, in metres; 0 without depth. Older frames are lifted by it."""
+    """z-depth of every patch of the grid, kept or not, in metres; 0 without depth. Older frames are
+    lifted by it."""
     tokens: Float[Tensor, "patch dim"]
     """R of section 6."""
     keys_values: Float[Tensor, "block 2 patch dim"]

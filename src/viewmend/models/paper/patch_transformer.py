@@ -71,9 +71,9 @@ class PatchTransformer(Network):
     ) -> list[Prediction]:
         """One prediction per view of any size, each from its own context. Gradients reach every parameter.
 
-        Camera images are encoded here in one batch; those of frames and cameras outside the view's window are ignored,
-        as in `step`. Pruning keeps `top_k` context tokens; None for the config's. Raises ValueError if the numbers of
-        views and contexts differ.
+        Camera images are encoded here in one batch; those of frames and cameras outside the view's
+        window are ignored, as in `step`. Pruning keeps `top_k` context tokens; None for the
+        config's. Raises ValueError if the numbers of views and contexts differ.
         """
         if len(views) != len(contexts):
             raise ValueError(

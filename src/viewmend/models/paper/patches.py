@@ -1,8 +1,9 @@
 """Overlapping patches, kept sparse (section 4), and their spatio-temporal coordinates (section 5).
 
-A patch is 7 x 7 cells of the feature map, 28 x 28 image pixels; patches are 4 cells, 16 pixels, apart. A patch is
-identified by its place (view, row, column); row 0 and column 0 start at the top left of the image. The grid covers
-the whole image and may extend beyond its right and bottom edges, where everything is zero.
+A patch is 7 x 7 cells of the feature map, 28 x 28 image pixels; patches are 4 cells, 16 pixels,
+apart. A patch is identified by its place (view, row, column); row 0 and column 0 start at the top
+left of the image. The grid covers the whole image and may extend beyond its right and bottom edges,
+where everything is zero.
 """
 
 import torch
@@ -62,8 +63,8 @@ def split(maps: Maps, places: Places, size: int, step: int) -> Patches:
 def merge(patches: Patches, places: Places, shape: tuple[int, int, int], step: int) -> tuple[Maps, Planes]:
     """Put patches back in their places with linearly blended overlaps (section 7).
 
-    `shape` is (views, height, width). Returns the images, 0 where no patch covers them, and the coverage, 1 or 0. The
-    blending weights sum to one at every covered pixel.
+    `shape` is (views, height, width). Returns the images, 0 where no patch covers them, and the
+    coverage, 1 or 0. The blending weights sum to one at every covered pixel.
     """
     views, height, width = shape
     channels, size = patches.shape[1:3]
@@ -106,8 +107,9 @@ def patch_depths(
 ) -> Float[Tensor, "view rows cols"]:
     """z-depth of every patch's centre, in metres (section 5).
 
-    A centre is where four pixels meet; its depth is the mean of those of the four that have one. Without any, it is
-    the median depth of the patch's foreground pixels, or 0 if none of them has a depth.
+    A centre is where four pixels meet; its depth is the mean of those of the four that have
+    one. Without any, it is the median depth of the patch's foreground pixels, or 0 if none
+    of them has a depth.
     """
     height, width = depth.shape[1:]
     rows, cols = grid_shape(height, width)

@@ -27,7 +27,8 @@ RECEPTIVE_RADIUS_PX = 29
 MARGIN_STEPS = -(-RECEPTIVE_RADIUS_PX // STEP_PX)
 """The receptive radius in patch steps, rounded up."""
 CROP_STEPS = 4
-"""Crop sizes are multiples of this number of patch steps, because convolutions are compiled for each new size."""
+"""Crop sizes are multiples of this number of patch steps, because convolutions are compiled for
+each new size."""
 SLOPE = 0.2
 """Negative slope of all leaky ReLUs."""
 
@@ -110,8 +111,9 @@ def relative_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "
 class Encoder(nn.Module):
     """FuseFormer's hierarchical encoder (section 3): nine 3 x 3 convolutions, features at 1/4 of the resolution.
 
-    From the sixth convolution on, the channels of the early features (the fourth convolution's output) and of the
-    latest features are split into as many groups as the convolution has, and concatenated group by group.
+    From the sixth convolution on, the channels of the early features (the fourth convolution's
+    output) and of the latest features are split into as many groups as the convolution has, and
+    concatenated group by group.
     """
 
     def __init__(self, config: PaperConfig) -> None:
@@ -167,8 +169,9 @@ class Tokeniser(nn.Module):
     def forward(self, stacks: Sequence[EncoderInput]) -> Float[Tensor, "patch dim"]:
         """Tokens of all kept patches of all stacks, in order.
 
-        Only a crop around each image's kept patches is encoded, including the encoder's receptive radius. The result
-        depends neither on the size of the crop nor on the other images of the batch.
+        Only a crop around each image's kept patches is encoded, including the encoder's
+        receptive radius. The result depends neither on the size of the crop nor on the
+        other images of the batch.
         """
         images = [pair for stack in stacks for pair in zip(stack.channels, stack.kept_on_host, strict=True)]
         # A batch pads all crops to the largest one, which is worthwhile on a GPU but not on a CPU.
@@ -192,7 +195,8 @@ class Tokeniser(nn.Module):
 def find_crop(kept: Bool[Tensor, "rows cols"]) -> tuple[tuple[int, int], tuple[int, int]]:
     """The crop of an image that contains all kept patches and the encoder's receptive radius around them.
 
-    Returns its first (row, column) in patch steps, negative outside of the image, and its height and width in pixels.
+    Returns its first (row, column) in patch steps, negative outside of the image, and its height
+    and width in pixels.
     """
     used = [torch.nonzero(kept.any(axis))[:, 0].tolist() or [0] for axis in (1, 0)]
     row, col = (steps[0] - MARGIN_STEPS for steps in used)

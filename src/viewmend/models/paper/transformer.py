@@ -112,8 +112,8 @@ def most_attended(received: PerKey, k: int) -> Int[Tensor, "sample kept"]:
 def straight_through(received: PerKey, keep: Bool[Tensor, "sample key"], k: int) -> PerKey:
     """1 for the k keys to keep that received most attention, 0 for the others.
 
-    The gradient is that of received / (received + threshold), 1/2 where the hard mask steps from 0 to 1, so that
-    pruned keys are trained, too.
+    The gradient is that of received / (received + threshold), 1/2 where the hard mask steps from 0
+    to 1, so that pruned keys are trained, too.
     """
     if k >= received.shape[1]:
         return keep.to(received.dtype)

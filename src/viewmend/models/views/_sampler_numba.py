@@ -173,8 +173,9 @@ def sample_camera(
 ):  # fmt: skip
     """`CameraFeatures` of the samples on rays first to end - 1 in one camera, and prior weights, not normalised.
 
-    Only the rays are sampled that have this camera among their `chosen` ones. `cubic` applies to colour and mask. With
-    a `min_coverage` above 0, distances behind the proxy are those of `RayFill`, and there are no prior weights.
+    Only the rays are sampled that have this camera among their `chosen` ones. `cubic` applies to
+    colour and mask. With a `min_coverage` above 0, distances behind the proxy are those of
+    `RayFill`, and there are no prior weights.
     """
     fine, wide, shapes = images
     per_near = 1 / (NEAR * size_m)

@@ -12,8 +12,8 @@ OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.1
 RAY_VIEWS = 4
 """A ray is sampled in this many of the source cameras: those near the viewer that see the proxy's surface."""
 FEATURES = 18
-"""A ray sample has this many features per camera: the 14 of `CameraFeatures`, RGB minus the cameras' mean, and the
-prior weight."""
+"""A ray sample has this many features per camera: the 14 of `CameraFeatures`, RGB minus the
+cameras' mean, and the prior weight."""
 COLOUR = slice(0, 3)
 """These features of a ray sample are the camera's RGB on black."""
 MASK = slice(3, 4)

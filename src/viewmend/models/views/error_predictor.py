@@ -26,7 +26,8 @@ from viewmend.models.views.sampler import Rays, sample_rays
 from viewmend.types import CompletedView, IncompleteView
 
 IMAGE_CHANNELS = 7
-"""A pixel has this many inputs: RGB, M, whether it is coloured, its largest source weight, and its relative depth."""
+"""A pixel has this many inputs: RGB, M, whether it is coloured, its largest source weight, and its
+relative depth."""
 DEEPEST = 2.0
 """Depths are clamped to this many subject sizes around the median."""
 BEHIND = (0.0, 0.012, 0.03, 0.06, 0.11, 0.2, 0.36)
@@ -34,8 +35,8 @@ BEHIND = (0.0, 0.012, 0.03, 0.06, 0.11, 0.2, 0.36)
 BEHIND_CHANNELS = 24
 """The network keeps this many features of the samples behind the proxy."""
 LARGE_PX = 128
-"""A subject is judged at half the resolution if nothing is re-synthesised and the root of its area is at least this,
-pixels."""
+"""A subject is judged at half the resolution if nothing is re-synthesised and the root of its area
+is at least this, pixels."""
 
 
 def fallback_view(

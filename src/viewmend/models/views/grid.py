@@ -228,9 +228,9 @@ def run_tiled(
 ) -> Float[Tensor, "pixel output"]:
     """The output of layers at some pixels of an image, from the tiles around these pixels only.
 
-    The image has `shape`. Its first channels are `cells`, at half its resolution, upsampled bilinearly; the others are
-    `values` at the pixels, else zeros. The layers are convolutions of odd kernels that keep the size, and
-    layers that act on single pixels.
+    The image has `shape`. Its first channels are `cells`, at half its resolution, upsampled
+    bilinearly; the others are `values` at the pixels, else zeros. The layers are convolutions of
+    odd kernels that keep the size, and layers that act on single pixels.
     """
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
     cell_halo = -(-halo // CELL_PX) + 1

@@ -2,11 +2,12 @@
 
     source cameras -> ray samples -> aggregation -> depth distribution -> blending -> prediction
 
-At half the resolution, samples at fixed offsets behind the proxy are taken along every ray, from the source cameras
-that see it best, and aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as
-networks on cost volumes do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the depth found, and
-blended. What blending softens comes back as two bands of detail, each from the blended colours, one camera or the
-rendered view, with a learned gain for every pixel.
+At half the resolution, samples at fixed offsets behind the proxy are taken along every ray, from
+the source cameras that see it best, and aggregated over cameras. A U-Net over the view turns them
+into a distribution over depths, as networks on cost volumes do (MVSNet, ENeRF). At full resolution,
+the cameras are sampled again at the depth found, and blended. What blending softens comes back as
+two bands of detail, each from the blended colours, one camera or the rendered view, with a learned
+gain for every pixel.
 """
 
 from dataclasses import replace
@@ -58,17 +59,20 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
-"""The cameras of a cell are chosen by their prior weights at these z-depths behind the proxy, in subject sizes."""
+"""The cameras of a cell are chosen by their prior weights at these z-depths behind the proxy, in
+subject sizes."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """A cell of the U-Net also has its relative depth, and whether it has a depth at all."""
 CANDIDATES = 4
 """A pixel blends this many colours: the fields of `CandidateColours`."""
 DETAILS = 3 * len(BAND_PX)
-"""A pixel has this many gains of detail: in each band those of the blended colours, of one camera, and of the guess."""
+"""A pixel has this many gains of detail: in each band those of the blended colours, of one camera,
+and of the guess."""
 INITIAL_GAIN = 0.3
 """The gain of the finest detail of the blended colours before training."""
 PIXEL_CHANNELS = 27
-"""The last convolutions get this many numbers per pixel, in addition to the features of the U-Net and the sample."""
+"""The last convolutions get this many numbers per pixel, in addition to the features of the U-Net
+and the sample."""
 OUTPUT_CHANNELS = (CANDIDATES, 1, 1, DETAILS)
 """The last convolutions give a score for each candidate colour, alpha, confidence, and gains of detail."""
 ALPHA_SLOPE = 4.0
@@ -251,7 +255,8 @@ class ViewSynthNet(Network):
     ) -> tuple[CompletedView, State]:
         """Predicts all of E on the proxy and its rim, or attenuates it where `view.fade` says so.
 
-        With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their surroundings.
+        With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from
+        their surroundings.
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)

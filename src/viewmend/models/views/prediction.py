@@ -23,10 +23,11 @@ Mask = Bool[Tensor, "height width"]
 MIN_MASK = 0.1
 """Colours on black are divided by their mask, but by no less than this."""
 HOLE_GUESS = 0.7
-"""The colour of a hole takes this share from `RayFill`, and the rest from `ViewSynthNet`, which saw few holes in
-training."""
+"""The colour of a hole takes this share from `RayFill`, and the rest from `ViewSynthNet`, which saw
+few holes in training."""
 SAME_SURFACE = 0.03
-"""A pixel shows the surface of its cell if their depths on the proxy differ by less than this, in subject sizes."""
+"""A pixel shows the surface of its cell if their depths on the proxy differ by less than this, in
+subject sizes."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ class SurfacePoints(NamedTuple):
     probability: Float[Tensor, "pixel"]
     """Its probability."""
     offset: Float[Tensor, "pixel"]
-    """Distance behind the proxy in subject sizes: the mean over the most probable hypothesis and its neighbours."""
+    """Distance behind the proxy in subject sizes: the mean over the most probable hypothesis and
+    its neighbours."""
     depth: Float[Tensor, "pixel"]
     """z-depth, metres."""
 
@@ -164,7 +166,8 @@ def surface_points(
 ) -> SurfacePoints:
     """The points that pixels show, by the depth distribution of the cells around them.
 
-    A pixel starts from its own depth on the proxy, unless its cell has the depth of another surface in front of it.
+    A pixel starts from its own depth on the proxy, unless its cell has the depth of another surface
+    in front of it.
     """
     # The most probable hypothesis, and the mean offset around it
     shares = distribution.interpolate(distribution.logits.softmax(1), pixels)

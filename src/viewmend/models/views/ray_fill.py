@@ -1,8 +1,8 @@
 """Fills holes pixel by pixel from the source cameras: the model `rays`, and the first guess of the default model.
 
-The true surface in a hole is at the proxy or behind it, and cameras that see it agree on its colour. So each missing
-pixel becomes a convex mix of candidates: the colours that the cameras have at points along its ray, a smooth fill, and
-background. The network only weighs the candidates.
+The true surface in a hole is at the proxy or behind it, and cameras that see it agree on its
+colour. So each missing pixel becomes a convex mix of candidates: the colours that the cameras have
+at points along its ray, a smooth fill, and background. The network only weighs the candidates.
 """
 
 from collections.abc import Sequence
@@ -57,11 +57,11 @@ COLOUR_CHANNELS = 7
 POINT_FEATURES = 16
 """The network keeps this many features of each point of a ray."""
 PIXELS_AT_ONCE = 512
-"""A chunk without gradients has this many pixels: the system allocates larger buffers page by page each time, which
-takes longer than the computation."""
+"""A chunk without gradients has this many pixels: the system allocates larger buffers page by page
+each time, which takes longer than the computation."""
 PIXELS_STEP = 64
-"""Layers get a multiple of this many pixels: convolutions and GELUs are compiled and kept for each number, which would
-be slow, and fragment the memory of a server."""
+"""Layers get a multiple of this many pixels: convolutions and GELUs are compiled and kept for each
+number, which would be slow, and fragment the memory of a server."""
 
 
 class RayInputs(NamedTuple):
@@ -268,8 +268,8 @@ def multi_scale_context(
 ) -> tuple[Float[Tensor, "neighbourhood 12 11 11"], Int[Tensor, "pixel"]]:
     """`RayInputs.neighbourhoods` of pixels (row, column), and the index of each pixel's neighbourhood.
 
-    Depth is relative: 0.5 at the subject's median, growing with distance, 0 where there is none. Cells meet at the
-    principal point, so that a crop of a view has the same cells.
+    Depth is relative: 0.5 at the subject's median, growing with distance, 0 where there is none.
+    Cells meet at the principal point, so that a crop of a view has the same cells.
     """
     # Sums over boxes of the view
     scale = SceneScale.of(view)

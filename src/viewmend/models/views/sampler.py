@@ -1,8 +1,9 @@
 """Samples the source cameras at points on the rays of a novel view, as IBRNet does (Wang et al., CVPR 2021).
 
-Both networks of the default model take their inputs from here: `ViewSynthNet` by `sample_rays`, from image pyramids;
-`RayFill` by `sample_fill_rays`, from full images and box means. The code in PyTorch is the reference for any device,
-and what `torch.export` traces. On the CPU, compiled kernels replace it (`_sampler_numba.py`).
+Both networks of the default model take their inputs from here: `ViewSynthNet` by `sample_rays`,
+from image pyramids; `RayFill` by `sample_fill_rays`, from full images and box means. The code in
+PyTorch is the reference for any device, and what `torch.export` traces. On the CPU, compiled
+kernels replace it (`_sampler_numba.py`).
 """
 
 from collections.abc import Callable, Sequence
@@ -45,7 +46,8 @@ class Rays(NamedTuple):
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""
     cameras: Int[Tensor, "ray view"] | None = None
-    """Indices of the source cameras that are sampled on each ray, or more if there are not enough; None for all."""
+    """Indices of the source cameras that are sampled on each ray, or more if there are not enough;
+    None for all."""
 
     def split(self, size: int | None) -> "list[Rays]":
         """Chunks of `size` rays; None gives one chunk."""
@@ -94,8 +96,9 @@ class RaySamples(NamedTuple):
     features: Float[Tensor, "ray sample view feature"]
     """`CameraFeatures`, stacked; of `sample_rays` all of `config.FEATURES`."""
     prior: Float[Tensor, "ray sample view"]
-    """Initial weights of the cameras, of `sample_rays` only: high near the viewer, and where the sample is not far
-    behind the proxy. The sum is 1, or 0 where no camera has the sample in view."""
+    """Initial weights of the cameras, of `sample_rays` only: high near the viewer, and
+    where the sample is not far behind the proxy. The sum is 1, or 0 where no camera has the
+    sample in view."""
     statistics: Float[Tensor, "ray sample 10"]
     """`RayStatistics`, stacked; `sample_fill_rays` computes only the masks."""
 
@@ -119,7 +122,8 @@ class CameraFeatures(NamedTuple):
     mean_colour: Float[Tensor, "ray sample view 3"]
     """RGB averaged around the sample: over `AROUND`, for `RayFill` over `PATCH`."""
     mean_mask: Float[Tensor, "ray sample view 1"]
-    """Mask averaged over `AROUND`: low near an outline. Hulls are too large where outlines of two cameras meet."""
+    """Mask averaged over `AROUND`: low near an outline. Hulls are too large where outlines of two
+    cameras meet."""
     mean_coverage: Float[Tensor, "ray sample view 1"]
     """Coverage by the proxy averaged over `AROUND`: above `mean_mask` where the proxy is too large."""
 
@@ -222,7 +226,8 @@ class _Boxes(NamedTuple):
 def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
     """Samples the pyramid levels of the source cameras that match rays which are `step_px` apart.
 
-    With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than bilinear ones.
+    With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than
+    bilinear ones.
     """
     if torch.compiler.is_exporting():
         return sample_rays_torch(rays, sources, step_px, cubic)

@@ -47,8 +47,9 @@ Points = Float64[np.ndarray, "point 2"]
 def refined(grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float) -> Points:
     """Move a board's corners to where its edges cross, in pixels; corners with too few edge pixels stay where they are.
 
-    They were found at `pixels`, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5). On the board, along
-    its edges, they are at `on_board_m`. `square_m` is a square's side, `marker_m` that of a marker in its middle.
+    They were found at `pixels`, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5).
+    On the board, along its edges, they are at `on_board_m`. `square_m` is a square's side,
+    `marker_m` that of a marker in its middle.
     """
     found = cv2.findHomography(on_board_m, pixels - 0.5, cv2.RANSAC, OUTLIER_PX)[0]
     if found is None:
@@ -234,8 +235,8 @@ def look_for(
 ) -> dict[tuple[int, int], Corners]:
     """The board's corners, by camera and time, at these indices of the footage's frames.
 
-    `track` wraps the cameras that are iterated over, as a progress bar. CaptureError if an image cannot be read, or has
-    another size than the camera's first.
+    `track` wraps the cameras that are iterated over, as a progress bar. CaptureError if an image
+    cannot be read, or has another size than the camera's first.
     """
     seen = {}
     clock = read_clock(footage)

@@ -1,8 +1,9 @@
 """Cameras from the corners of a board that was moved about: each camera by itself, then all together.
 
-OpenCV calibrates each camera first; cameras are chained by the times at which two of them see the board. The bundle
-adjustment then moves all cameras and all poses of the board until corners lie where they were found (Triggs et al.,
-"Bundle adjustment: a modern synthesis", 2000). World is the first camera's frame.
+OpenCV calibrates each camera first; cameras are chained by the times at which two of them see the
+board. The bundle adjustment then moves all cameras and all poses of the board until corners lie
+where they were found (Triggs et al., "Bundle adjustment: a modern synthesis", 2000). World is the
+first camera's frame.
 """
 
 from collections.abc import Mapping, Sequence

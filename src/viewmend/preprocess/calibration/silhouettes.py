@@ -1,10 +1,11 @@
 """Cameras refined by silhouettes: the line of sight of each point of an outline must touch what all others see.
 
-A point of an outline lies on the subject's surface. So somewhere along its line of sight there is a place that no other
-camera sees outside of its mask. How far outside the best one is, in pixels, is what the calibration misses (after
-Hernandez, Schmitt and Cipolla, "Silhouette coherence for camera calibration under circular motion", PAMI 2007, and
-Boyer, "On using silhouettes for camera calibration", ACCV 2006). Gauss and Newton's method moves all cameras, and each
-place along its line, until little is missed. No surface is carved, so that parts of a pixel count.
+A point of an outline lies on the subject's surface. So somewhere along its line of sight there is a
+place that no other camera sees outside of its mask. How far outside the best one is, in pixels, is
+what the calibration misses (after Hernandez, Schmitt and Cipolla, "Silhouette coherence for camera
+calibration under circular motion", PAMI 2007, and Boyer, "On using silhouettes for camera
+calibration", ACCV 2006). Gauss and Newton's method moves all cameras, and each place along its
+line, until little is missed. No surface is carved, so that parts of a pixel count.
 """
 
 from collections.abc import Sequence
@@ -31,8 +32,9 @@ Places = Float64[np.ndarray, "point 3"]
 def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
     """The rig turned, moved and scaled as a whole, so that its cameras agree with `reference` on the points.
 
-    `reference` has the same cameras in the frame that is wanted, in which `points_world` are where the subject may be.
-    The rotation, translation and scale are Umeyama's, of the points in each camera's own frame (PAMI 1991).
+    `reference` has the same cameras in the frame that is wanted, in which `points_world` are where
+    the subject may be. The rotation, translation and scale are Umeyama's, of the points in each
+    camera's own frame (PAMI 1991).
     """
     there = torch.cat([points_world, torch.ones_like(points_world[:, :1])], 1).double()
     here = there @ reference.camera_from_world.double().mT @ invert_rigid(rig.camera_from_world.double()).mT
@@ -62,8 +64,8 @@ LEAST_CAMERAS = 3
 CAMERA = 7
 """Parameters of a camera: rotation, translation, focal length; each in pixels that it moves what is seen."""
 HOLDS = (1e-3, 0.1)
-"""Strength of the prior on the present cameras, since outlines do not determine everything. The second value is for few
-frames and hard masks; held-out cameras decide which is better."""
+"""Strength of the prior on the present cameras, since outlines do not determine everything. The
+second value is for few frames and hard masks; held-out cameras decide which is better."""
 SEARCHES = 6
 """The best places on the lines of sight are searched at most this many times."""
 STEPS = 6
@@ -86,7 +88,8 @@ class Refinement:
 
     cameras: Cameras
     before_px: float
-    """How far a line of sight of an outline is outside the other masks at best, root mean square, as calibrated."""
+    """How far a line of sight of an outline is outside the other masks at best, root mean square,
+    as calibrated."""
     after_px: float
     """The same, refined."""
 
@@ -96,9 +99,9 @@ def refine_by_silhouettes(
 ) -> Refinement:
     """Refine poses and focal lengths of `LEAST_CAMERAS` or more; several frames constrain them better than one.
 
-    The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one for each frame;
-    `hold` is one of `HOLDS`. Here and below, a CaptureError is raised for frames without masks, and a ValueError for
-    masks without outlines or without a common subject.
+    The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one
+    for each frame; `hold` is one of `HOLDS`. Here and below, a CaptureError is raised for frames
+    without masks, and a ValueError for masks without outlines or without a common subject.
     """
     cameras = frames[0].cameras
     sights = [lines_of_sight(frame, box) for frame, box in zip(frames, bounds, strict=True)]

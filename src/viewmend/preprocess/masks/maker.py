@@ -15,7 +15,8 @@ Colours = Float32[np.ndarray, "height width 3"]
 SPECK = 1e-3
 """Parts of the foreground smaller than this share of the image are dropped."""
 PINHOLE = 2e-4
-"""Holes in the foreground smaller than this share of the image are filled; larger ones may be seen through."""
+"""Holes in the foreground smaller than this share of the image are filled; larger ones may
+be seen through."""
 
 OUTLINE_PX = 2
 """How far from the outline pixels may be soft."""
@@ -45,8 +46,8 @@ def demand_size(rgb: Rgb, expected: np.ndarray, what: str) -> None:
 def soft_mask(distance: Values, sure: float, possible: float) -> Mask:
     """Mask from the colour distance to the background, with hysteresis.
 
-    Pixels above `possible` count if connected to one above `sure`; specks are dropped and pinholes filled. Along the
-    outline, opacity is the distance relative to the largest one nearby.
+    Pixels above `possible` count if connected to one above `sure`; specks are dropped and pinholes
+    filled. Along the outline, opacity is the distance relative to the largest one nearby.
     """
     inside = _connected(distance >= possible, distance >= sure)
     inside = _large(~_large(~inside, PINHOLE * inside.size), SPECK * inside.size)
@@ -96,7 +97,8 @@ KEYS = {"green": 1, "blue": 2}
 SURE = 0.5
 """Pixels this far from the key's colour are foreground, as a share of the key's own excess."""
 POSSIBLE = 0.3
-"""Pixels this far from the key's colour are foreground where they touch sure ones, as a share of its excess."""
+"""Pixels this far from the key's colour are foreground where they touch sure ones, as a share of
+its excess."""
 DARK = 24
 """A key that is darker than this, in levels, is black: what is brighter is foreground."""
 EDGE = 1 / 100
@@ -106,8 +108,8 @@ EDGE = 1 / 100
 class ChromaMasks:
     """Makes masks of what is neither of the key's colour nor, where `dark` is set, dark.
 
-    A pixel's excess is by how much its key channel is above the larger other one, relative to that channel: light and
-    shadow on a screen do not change it.
+    A pixel's excess is by how much its key channel is above the larger other one, relative to that
+    channel: light and shadow on a screen do not change it.
     """
 
     def __init__(self, key: str = "green", dark: bool = False):
@@ -129,8 +131,9 @@ class ChromaMasks:
 def without_spill(rgb: Rgb, mask: Mask, screen: Rgb) -> Rgb:
     """Remove green or blue light of the `screen` from the outline of the subject.
 
-    Near the outline, where the screen's image has more green (or blue) than any other colour, the subject keeps no more
-    of it than of its larger other colour. What lies farther inside keeps its colours.
+    Near the outline, where the screen's image has more green (or blue) than any other
+    colour, the subject keeps no more of it than of its larger other colour. What lies
+    farther inside keeps its colours.
     """
     reach = max(1, round(EDGE * max(rgb.shape[:2])))
     inside = (mask > 127).astype(np.uint8)

@@ -25,7 +25,8 @@ CARVED_PX = 480
 MARGIN_PX = 4
 """Dilation of silhouettes and hulls, for inexact calibration and voxels."""
 GAP = 1 / 24
-"""Gaps of a mask up to this share of the image's longer side are filled where the other cameras support it."""
+"""Gaps of a mask up to this share of the image's longer side are filled where the other cameras
+support it."""
 GROUP = 3
 """Cameras per group; a pixel is kept if any group supports it, so that one bad mask has no effect."""
 
@@ -33,9 +34,9 @@ GROUP = 3
 def agreed(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
     """Clean the masks of one frame, each with the hull of the others.
 
-    A pixel is dropped where the hull of no group of the others is seen; it is filled where those of all groups are, and
-    the camera's own mask lies around it. Masks of fewer than three cameras, and those that agree on nothing, come back
-    as they are.
+    A pixel is dropped where the hull of no group of the others is seen; it is filled where those of
+    all groups are, and the camera's own mask lies around it. Masks of fewer than three cameras, and
+    those that agree on nothing, come back as they are.
     """
     if len(cameras) < 3:
         return mask
@@ -101,11 +102,12 @@ class MaskedCapture(CaptureWrapper):
     source: CaptureSource
     makers: Mapping[str, MaskMaker]
     clean_up: CleanUp = "none"
-    """What the other cameras and the neighbouring frames correct: nothing; whole connected parts, dropped where they
-    lie outside the hull of the other cameras (bystanders); or pixels, dropped and filled, for methods that err by
-    colour."""
+    """What the other cameras and the neighbouring frames correct: nothing; whole connected parts,
+    dropped where they lie outside the hull of the other cameras (bystanders); or pixels, dropped
+    and filled, for methods that err by colour."""
     screens: Mapping[str, Rgb] | None = None
-    """Background behind each camera's subject, whose green or blue is removed from the outline. None: leave colours."""
+    """Background behind each camera's subject, whose green or blue is removed from the outline.
+    None: leave colours."""
     _near: dict[int, MultiViewFrame] = field(default_factory=dict)
     """Frames around the last one, with the masks of the makers."""
 

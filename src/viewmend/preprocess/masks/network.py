@@ -21,9 +21,10 @@ MODNET_STEP = 32
 class NetworkMasks:
     """Makes masks by a network of one image, or of an image and its clean plate.
 
-    Images are given as (1, 3, height, width) in float32, in the size that the file fixes. Where it fixes none, two
-    inputs (BackgroundMattingV2) come at full size, one (MODNet) reduced. Two are in [0, 1], one is in [-1, 1].
-    ValueError if the file is no such network, or needs a plate and there is none.
+    Images are given as (1, 3, height, width) in float32, in the size that the file fixes.
+    Where it fixes none, two inputs (BackgroundMattingV2) come at full size, one (MODNet)
+    reduced. Two are in [0, 1], one is in [-1, 1]. ValueError if the file is no such
+    network, or needs a plate and there is none.
     """
 
     def __init__(self, file: Path, plate: Rgb | None = None):

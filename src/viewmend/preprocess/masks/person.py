@@ -1,8 +1,9 @@
 """Masks of people by MediaPipe's pose networks, run by onnxruntime: no clean plate and no screen needed.
 
-A detector finds people in the whole image; a second network segments each in a rotated square around the person and
-returns landmarks, from which the square of the next image follows. So the detector runs only on the first image and
-where a person is lost or has not been found. The weights come with the package (weights/person/README.md).
+A detector finds people in the whole image; a second network segments each in a rotated square
+around the person and returns landmarks, from which the square of the next image follows. So the
+detector runs only on the first image and where a person is lost or has not been found. The weights
+come with the package (weights/person/README.md).
 """
 
 import itertools
@@ -32,7 +33,8 @@ MAX_OVERLAP = 0.3
 ROI_SCALE = 1.25
 """Side of the square around a person over the diameter of the circle that the landmarks span."""
 OUTWARD = 0.6
-"""Added to the segmenter's logits, whose outlines lie inside those of people: IoU 0.01 higher on two captures."""
+"""Added to the segmenter's logits, whose outlines lie inside those of people: IoU 0.01 higher on
+two captures."""
 DETECT_EVERY = 15
 """Images after which the detector looks for further people while some are tracked."""
 
@@ -112,8 +114,8 @@ def _run(name: str, image: Float32[np.ndarray, "side side 3"]) -> list[np.ndarra
 def _detect(rgb: Rgb, small_people: bool = False) -> list[Roi]:
     """The squares around the people in an image, the surest first.
 
-    With `small_people`, an image in which the detector finds none is searched in overlapping tiles, too: people of
-    less than a quarter of the longer side are too small for it.
+    With `small_people`, an image in which the detector finds none is searched in overlapping tiles,
+    too: people of less than a quarter of the longer side are too small for it.
     """
     height, width = rgb.shape[:2]
     if (found := _detect_in(rgb, 0, 0, max(height, width))) or not small_people:

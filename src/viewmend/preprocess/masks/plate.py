@@ -31,7 +31,8 @@ MOST_GAIN = 1.6
 class PlateMasks:
     """Makes masks of what differs from the plate, shadows apart; the same for the same image, at any time.
 
-    Exposure that wandered since the plate is brought back first. A shadow is the plate times one number a pixel.
+    Exposure that wandered since the plate is brought back first. A shadow is the plate times one
+    number a pixel.
     """
 
     def __init__(self, plate: Rgb):
@@ -98,7 +99,8 @@ MOST_FRAMES = 25
 def plates_from_files(capture: CaptureFolder, place: str) -> dict[str, Rgb]:
     """The plate of each camera, undistorted: `place` is a path with `{camera}`, or a folder of files named after them.
 
-    Of a video the median is taken. CaptureError if a camera has no plate that can be read and is of its images' size.
+    Of a video the median is taken. CaptureError if a camera has no plate that can be read and is of
+    its images' size.
     """
     plates = {}
     for name, path in zip(capture.cameras.names, _paths(capture.cameras.names, place), strict=True):

@@ -1,7 +1,8 @@
 """The body's shape: a torso and four limbs as surfaces around their axes, joined by a smooth union of their fields.
 
-Each part is both a parametric surface (angle around the axis, place along it), which gives texture coordinates, and
-a field (signed distance, first order), which gives the union and the skinning weights. A garment is a bigger body.
+Each part is both a parametric surface (angle around the axis, place along it), which gives texture
+coordinates, and a field (signed distance, first order), which gives the union and the skinning
+weights. A garment is a bigger body.
 """
 
 from dataclasses import dataclass, replace
@@ -185,8 +186,8 @@ class Body:
     def settle(self, points: Points, outward: Points, part: int) -> Points:
         """Move a part's surface outward onto the smooth union of all parts.
 
-        The other parts count as 2 mm thinner: this part's sheet dives under theirs exactly where their fields cross,
-        so that overlapping sheets meet in a clean seam.
+        The other parts count as 2 mm thinner: this part's sheet dives under theirs exactly where
+        their fields cross, so that overlapping sheets meet in a clean seam.
         """
         bias = np.full(5, 0.002)
         bias[part] = 0.0

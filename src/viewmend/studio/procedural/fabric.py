@@ -338,7 +338,8 @@ def _grid_normals(patch: Patch, triangles: Int[np.ndarray, "face 3"]) -> Float[n
 def pack_charts(charts: list[Float[np.ndarray, "_ _ 3"]]) -> tuple[list[tuple[int, int]], Image]:
     """Shelve the charts in one near-square image: (left, top) of each in pixels, and the image.
 
-    Each chart is framed by a gutter that repeats its edge, so that sampling near an edge never reaches a neighbour.
+    Each chart is framed by a gutter that repeats its edge, so that sampling near an edge never
+    reaches a neighbour.
     """
     gutter = ATLAS_GUTTER_PX
     sizes = [(c.shape[1] + 2 * gutter, c.shape[0] + 2 * gutter) for c in charts]

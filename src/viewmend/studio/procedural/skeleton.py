@@ -1,6 +1,7 @@
 """The performers' skeleton: joints, people's builds, and poses by two-bone inverse kinematics.
 
-The bind pose is an A-pose that faces +z, left side at +x, arms `ARM_ANGLE_RAD` away from hanging straight down.
+The bind pose is an A-pose that faces +z, left side at +x, arms `ARM_ANGLE_RAD` away from hanging
+straight down.
 """
 
 import itertools
