@@ -69,10 +69,10 @@ class StreamConfig:
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 2000.0
-    """Above this, frames are dropped: first those that the inpainter's temporal window does not
-    need, the least recently used first. The default holds the window of `paper-small` for 8 cameras
-    of 512 x 512 pixels, all of them encoded. None: frames are dropped once no temporal window
-    reaches back to them."""
+    """Frames are dropped above this much memory, MB: first those that the inpainter's temporal
+    window does not need, the least recently used first. The default holds the window of
+    `paper-small` for 8 cameras of 512 x 512 pixels, all of them encoded. None: frames are dropped
+    once no temporal window reaches back to them."""
 
     def __post_init__(self) -> None:
         if self.geometry not in get_args(Geometry):

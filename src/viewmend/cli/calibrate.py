@@ -31,11 +31,11 @@ class Options:
     dictionary: str = "DICT_5X5_1000"
     """OpenCV's name of the board's marker dictionary."""
     every: int = 5
-    """With --board: search every n-th frame for it."""
+    """Only every n-th frame is searched for the board (with --board)."""
     silhouettes: bool = False
     """Refine a capture's poses and focal lengths with its masks."""
     num_frames: int = 12
-    """With --silhouettes: number of frames to use, evenly spread."""
+    """Number of frames to use, evenly spread (with --silhouettes)."""
     frames: str | None = None
     """Frames to use, as FIRST:END by index; either may be omitted."""
     format: str | None = None

@@ -40,7 +40,8 @@ class ViewOptions:
     leave correct pixels unchanged; 'predicted', which a model predicts to be wrong; or
     FILE.py:NAME, your own rule. By default, the rule that the model is made for."""
     refine_fraction: float = 0.15
-    """With the error rule 'predicted': largest fraction of the subject to inpaint, all holes first."""
+    """Largest fraction of the subject to inpaint, all holes first (with the error rule
+    'predicted')."""
 
     def config(self) -> "RenderConfig":
         """The renderer's configuration; ValueError for options that are out of range."""

@@ -32,7 +32,7 @@ class Options:
     key: Literal["green", "blue"] = "green"
     """Colour of the screen, for --method chroma."""
     dark: bool = False
-    """With --method chroma: treat dark pixels as background too, for stages with black walls."""
+    """Treat dark pixels as background too, for stages with black walls (with --method chroma)."""
     network: Path | None = None
     """ONNX file for --method onnx: a matting network that takes an image, or an image and its clean plate."""
     no_clean: bool = False

@@ -64,8 +64,8 @@ class Options:
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea',
     'reprojection', 'dstt-o-mul', FILE.py:NAME). By default 'views'."""
     top_k: int | None = None
-    """For the paper's model: context tokens kept by pruning; by default the model's own number.
-    Fewer is faster."""
+    """Number of context tokens that the paper's model keeps when pruning; by default the model's
+    own. Fewer is faster."""
     frames: str | None = None
     """Frames to use, as FIRST:END by index; all by default."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)

@@ -80,17 +80,17 @@ class Options:
     ray: str | None = None
     """Address of a Ray cluster that renders: HOST:PORT, auto, or local (needs viewmend[ray])."""
     replicas: int = 2
-    """With --ray: minimum number of rendering processes."""
+    """Minimum number of rendering processes (with --ray)."""
     max_replicas: int | None = None
-    """With --ray: maximum number of rendering processes; by default --replicas."""
+    """Maximum number of rendering processes (with --ray); by default --replicas."""
     cameras: int = 8
-    """With 'studio': number of cameras."""
+    """Number of cameras of 'studio'."""
     frames: int = 60
-    """With 'studio': number of frames."""
+    """Number of frames of 'studio'."""
     size: int = 320
-    """With 'studio': width and height of the images, in pixels."""
+    """Width and height of the images of 'studio', in pixels."""
     seed: int | None = None
-    """With 'studio': seed of the scene; by default one that no model was trained with."""
+    """Seed of the scene of 'studio'; by default one that no model was trained with."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     precision: Precision = "auto"

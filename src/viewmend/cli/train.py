@@ -108,7 +108,7 @@ def run(options: Options) -> int:
 
 
 def _show_gain(options: Options) -> None:
-    """After fine-tuning: the scores before and after by camera, and a contact sheet."""
+    """Print the scores before and after fine-tuning, by camera, and write a contact sheet."""
     scenes = options.config.scenes
     start = options.config.start
     if scenes.hold_out is None or start is None or not scenes.captures:

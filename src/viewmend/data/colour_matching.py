@@ -26,7 +26,7 @@ from viewmend.types import MultiViewFrame
 MAX_POINTS = 6000
 """Maximum number of surface points."""
 MIN_COSINE = 0.35
-"""Between the normal and the direction to a camera; surface seen at a flatter angle is ignored."""
+"""Smallest cosine between a surface's normal and the direction to a camera that is used."""
 MIN_MASK = 0.99
 """Points with a lower mask value are too close to the outline."""
 DEPTH_TOLERANCE = 0.01
@@ -39,7 +39,7 @@ LONGEST_PX = 256
 """Images are reduced to this size, in which the error of the hull is only a few pixels."""
 HULL = HullConfig(resolution=64)
 MIN_CAMERAS = 4
-"""In smaller rigs too little surface is shared to validate the maps."""
+"""Smallest rig that is matched: fewer cameras share too little surface to validate the maps."""
 INLIER = 0.03
 """Colours farther from the mean get less weight: highlights, and surface that the hull misplaces."""
 CLIPPED = 0.98
@@ -67,7 +67,7 @@ class SurfaceColours:
     """Colours of surface points in every camera."""
 
     rgb: Float[Tensor, "view point 3"]
-    """In [0, 1], as stored in the images."""
+    """Colours as stored in the images, in [0, 1]."""
     seen: Bool[Tensor, "view point"]
     """Whether a camera sees the point well."""
 
@@ -144,7 +144,7 @@ class ColourMatch:
     names: tuple[str, ...]
     """The cameras that have a map."""
     maps: Maps
-    """From (r, g, b, 1) to (r, g, b), values in [0, 1]."""
+    """Matrices that map (r, g, b, 1) to (r, g, b), values in [0, 1]."""
     before: float
     """Mean RGB distance of the colours of a point to their mean."""
     after: float

@@ -89,7 +89,7 @@ class VideoClock:
     """The times of a capture, and the frame of each film at each of them."""
 
     tracks: tuple[Track, ...]
-    """With offsets subtracted from their times."""
+    """The films; offsets are already subtracted from their times."""
     reference_fps: float | None
     """Frames per second of the film that sets the times; at least half of the cameras are as fast."""
     times_s: Float64[np.ndarray, "time"]

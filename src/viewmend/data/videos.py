@@ -151,7 +151,7 @@ def video_properties(path: Path) -> VideoProperties:
 
 @functools.lru_cache(maxsize=512)
 def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
-    """As `video_properties`; `_version` changes with the file."""
+    """Compute `video_properties`; `_version` changes with the file."""
     with _open_video(path) as container:
         stream = container.streams.video[0]
         codec = stream.codec_context

@@ -1,4 +1,4 @@
-"""From the scores of frames to the tables of a report.
+"""Turns the scores of frames into the tables of a report.
 
 Scores are averaged over the frames of a scene first: a `Record` is one metric of one method on one
 scene. Tables and files are queries of records.
@@ -102,9 +102,9 @@ class Row:
     """Scenes that have a frame with enough hole pixels."""
     failed: int
     vfid: dict[str, float | None]
-    """By `scores.KINDS`; None without I3D or with a single video."""
+    """VFID by `scores.KINDS`; None without I3D or with a single video."""
     speed: Speed | None
-    """Over all frames with holes; None without any."""
+    """Speed over all frames with holes; None without any."""
 
 
 @dataclass(frozen=True)

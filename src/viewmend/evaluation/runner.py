@@ -150,7 +150,7 @@ def _start_worker(threads: int) -> None:
 
 
 def _exit_with_parent() -> None:
-    """Without this, a worker whose parent was killed would wait for work forever."""
+    """End a worker whose parent was killed; it would wait for work forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

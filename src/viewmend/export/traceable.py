@@ -38,14 +38,14 @@ LARGEST_PX = 4096
 LEVELS = 11
 """An image pyramid has this many levels: enough for a shorter side of `LARGEST_PX`."""
 CONSTANT = 5
-"""From this level on, the canvases of an image pyramid have the same size for all images: 130 pixels."""
+"""The first level of an image pyramid whose canvas has the same size for all images: 130 pixels."""
 SPARE = 16
 """The sheet of `_packed` has this many rows more than the finest level, for the borders of the
 levels next to it."""
 FILL_LEVELS = 12
 """The smooth fill halves a view this many times, until one pixel is left."""
 FILL_CONSTANT = 3
-"""From this level on, the canvases of the smooth fill have the same size for all views."""
+"""The first level of the smooth fill whose canvas has the same size for all views."""
 
 
 class ViewInputs(NamedTuple):

@@ -34,7 +34,7 @@ class Alignment:
     """The shift of all principal points, and its effect."""
 
     offset_px: tuple[float, float]
-    """To add to (cx, cy) of every camera; zeros where no shift is worth it."""
+    """Shift to add to (cx, cy) of every camera; zeros if no shift is worth it."""
     iou_before: float
     """Mean IoU of the hull's silhouettes and the masks, as calibrated."""
     iou_after: float

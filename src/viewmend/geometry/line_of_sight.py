@@ -46,7 +46,7 @@ class LineSamples:
     """Places along lines of sight as all cameras see them."""
 
     in_camera: Float64[np.ndarray, "point place view 3"]
-    """In each camera's frame."""
+    """The points in each camera's frame, metres."""
     outside_px: Float64[np.ndarray, "point place view"]
     """How far outside of each mask; 0 inside, where a camera does not see it, and in the
     line's own camera."""
@@ -155,7 +155,10 @@ class LinesOfSight:
 def _find_outline(
     mask: UInt8[np.ndarray, "height width"], count: int
 ) -> tuple[Float64[np.ndarray, "point 2"], Float32[np.ndarray, "height width"]] | None:
-    """About `count` points, evenly along the foreground's outline, and how far outside of it each pixel's centre is.
+    """Find points on the foreground's outline, and how far outside of it each pixel's centre is.
+
+    Returns about `count` points, evenly spaced along the outline. Distances are negative inside;
+    the result is None without an outline.
 
     Negative inside; None without an outline.
     """

@@ -19,7 +19,7 @@ AGREED = 0.5
 MARGIN = 0.06
 """A fitted path leaves this fraction of half an image free around the subject."""
 FITTED_FRAMES = 24
-"""At most this many frames of a motion are reconstructed to find what the motion covers."""
+"""The largest number of frames of a motion that are reconstructed to find what it covers."""
 FITTED_RESOLUTION = 64
 """Their hulls have this many voxels along the longest side."""
 FULL_TURN_GAP_RAD = math.radians(130)
@@ -135,7 +135,7 @@ def coarse_surface(
 
 
 def thinned(moments: Sequence[int]) -> list[int]:
-    """At most `FITTED_FRAMES` of these, evenly spaced: enough to know what a motion covers."""
+    """Select at most `FITTED_FRAMES` moments, evenly spaced: enough to know what a motion covers."""
     return list(moments[:: -(-len(moments) // FITTED_FRAMES) or 1])
 
 

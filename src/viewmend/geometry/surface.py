@@ -112,7 +112,7 @@ def _march_tables(device: torch.device) -> tuple[Int[Tensor, "256 5 3"], Int[Ten
 
 @cache
 def triangle_table() -> Int[Tensor, "256 5 3"]:
-    """For each case up to five triangles, as edges whose crossings are their corners; -1 where there are fewer.
+    """Up to five triangles per case, as edges whose crossings are their corners; -1 pads the rest.
 
     The surface cuts each face of a cell by a rule that looks at that face alone (inside corners
     that touch only diagonally stay apart), and no triangle has another side in a face. So

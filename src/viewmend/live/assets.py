@@ -93,7 +93,7 @@ class FrameAssets:
 
     shape: Asset
     images: tuple[Asset, ...]
-    """In the order of the shape's cameras."""
+    """One image for each camera of the shape, in its order."""
 
     @property
     def size_bytes(self) -> int:

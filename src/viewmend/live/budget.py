@@ -79,11 +79,11 @@ class Ladder:
     """The quality levels for one kind of model."""
 
     levels: tuple[QualityLevel, ...]
-    """From the cheapest to `FULL`."""
+    """All levels, from the cheapest to `FULL`."""
     moving: QualityLevel
-    """For a moving view if there is no budget."""
+    """The level of a moving view if there is no budget."""
     still: QualityLevel
-    """For a view that has just come to rest: sharp and quickly rendered."""
+    """The level of a view that has just come to rest: sharp and quickly rendered."""
 
 
 SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
@@ -198,7 +198,7 @@ class ResolutionLimit:
 
     def __init__(self) -> None:
         self._seconds_per_px: deque[float] = deque(maxlen=16)
-        """Of the last large images; the slowest counts."""
+        """Seconds per pixel of the last large images; the slowest counts."""
 
     def record(self, pixels: float | int, level: QualityLevel, seconds: float) -> None:
         """Add the time of an image of this many pixels at this level."""

@@ -101,7 +101,7 @@ class Frame:
     """One received frame."""
 
     header: dict[str, Any]
-    """As in docs/live-protocol.md."""
+    """The frame's header (docs/live-protocol.md)."""
     images: dict[tuple[int, str], UInt8[np.ndarray, "height width 3"]]
     """RGB images by eye and mode."""
     depth: dict[int, Float[np.ndarray, "h w"]]

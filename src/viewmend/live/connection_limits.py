@@ -248,28 +248,28 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         asyncio.get_running_loop().call_soon(self._forward)
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """As the socket's transport."""
+        """Information that the socket's transport has about the connection."""
         return self._transport.get_extra_info(name, default)
 
     def get_write_buffer_size(self) -> int:
-        """As the socket's transport."""
+        """Number of bytes that are waiting to be sent."""
         return self._transport.get_write_buffer_size()
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """As the socket's transport, if that is still open."""
+        """Write to the socket's transport if it is still open."""
         if not self.is_closing():
             self._transport.write(data)
 
     def is_closing(self) -> bool:
-        """As the socket's transport."""
+        """Whether the socket is closed or closing."""
         return self._transport.is_closing()
 
     def close(self) -> None:
-        """As the socket's transport."""
+        """Close the connection after sending what is waiting."""
         self._transport.close()
 
     def abort(self) -> None:
-        """As the socket's transport."""
+        """Close the connection at once."""
         self._transport.abort()
 
 

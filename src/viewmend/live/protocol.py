@@ -242,7 +242,7 @@ class FrameTimes(StageTimes):
     encode: float = 0.0
     """Encoding as JPEG or video."""
     wait: float = 0.0
-    """From the arrival of a look to the start of its first frame."""
+    """Time from the arrival of a look to the start of its first frame."""
 
     def as_json(self, frames: int = 1) -> dict[str, float]:
         """The protocol's `stage_ms`; means if this is the sum of several frames."""

@@ -33,7 +33,7 @@ MAX_PIXELS = 64_000_000
 IMAGE_BYTES = 65_536
 """Bytes of an encoded image in addition to four per pixel."""
 MAX_FRAME_BYTES = 8 + HEADER_BYTES + 4 * MAX_PIXELS + MAX_CAMERAS * IMAGE_BYTES
-"""Of any rig; a rig's own limit is that of its images."""
+"""Largest frame of any rig, in bytes; a rig's own limit is that of its images."""
 SILENT_S = 30.0
 """A rig that sends nothing for this long is disconnected."""
 ImageSide = Annotated[int, Meta(ge=8, le=16384)]

@@ -46,7 +46,7 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     error_rule: protocol.Rule | None = None
     background: protocol.Colour | None = None
     model: protocol.Model | None = None
-    """As in `protocol.Look`."""
+    """See `protocol.Look`."""
 
 
 NameList = Annotated[str, Meta(max_length=4096)]

@@ -66,7 +66,7 @@ class RenderResult:
     completed: tuple[CompletedView, ...]
     """One view per eye."""
     viewer: State
-    """For the viewer's next request."""
+    """The state to pass with the viewer's next request."""
     times: StageTimes
     """Times of all eyes together; geometry and context are 0 if an earlier view has computed them."""
     background: str = BLACK

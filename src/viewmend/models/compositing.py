@@ -19,7 +19,8 @@ Background = Literal["black", "white"]
 Image = Float[Tensor, "3 height width"]
 Plane = Float[Tensor, "height width"]
 RELIABLE = 0.25
-"""From this alpha on, a pixel's own colour is used where the target mask makes it opaque."""
+"""The smallest alpha at which a pixel keeps its own colour where the target mask makes it
+opaque."""
 BLOCKS_PX, OPAQUE_ENOUGH = (4, 8, 16, 32, 64, 128), 0.1
 """Sizes of the blocks whose mean colour others take, and the mean alpha that a block must have."""
 

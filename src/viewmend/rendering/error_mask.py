@@ -50,7 +50,8 @@ class Evidence:
 
 
 ErrorRule = Callable[[Evidence], Float[Tensor, "height width"]]
-"""From the evidence to E, floats in [0, 1]: 1 on all pixels of the proxy where the blend has no colour."""
+"""Computes E from the evidence, floats in [0, 1]: 1 on all pixels of the proxy where the
+blend has no colour."""
 
 
 def holes(evidence: Evidence) -> Float[Tensor, "height width"]:

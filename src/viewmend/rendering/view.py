@@ -1,4 +1,4 @@
-"""From the images of one frame to an incomplete novel view: select source cameras, blend them, find the holes."""
+"""Renders an incomplete novel view from a frame: selects source cameras, blends them, finds holes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -75,7 +75,8 @@ class Garments:
     along_m: Plane
     """Height above the soles; on arms `SHOULDER_M` at the shoulder, falling towards the hand."""
     dress: tuple[int, ...]
-    """For each garment the number of the colour that it was found by: the halves of an overall share it."""
+    """Number of the colour that each garment was found by; both halves of an overall have
+    the same."""
     shoes: tuple[bool, ...]
     """Garments that are on the feet."""
 

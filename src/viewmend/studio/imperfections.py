@@ -18,7 +18,7 @@ Picture = UInt8[Tensor, "3 height width"]
 Mask = UInt8[Tensor, "height width"]
 Backdrop = Float[Tensor, "3 height width"]
 Seeds = tuple[int, int, int]
-"""Of the capture, the camera's position, and the time."""
+"""Seeds of the capture, the camera's position, and the time."""
 SPILL_PX = 3.0
 """Standard deviation of the blur that measures the distance to the outline."""
 
@@ -54,7 +54,7 @@ class Imperfections:
 
     @classmethod
     def typical(cls) -> "Imperfections":
-        """About what an average real stage has."""
+        """Imperfections of an average real stage."""
         return cls(
             exposure_stops=0.08,
             white_balance=0.02,

@@ -181,8 +181,8 @@ class Retarget:
     upright_from_file: Float[Tensor, "4 4"]
     """The motion that brings the character upright."""
     driver: tuple[int, ...]
-    """For each node of the character the position among `rotations`' joints that turns it,
-    -1 where none does."""
+    """Index into `rotations` of the joint that turns each node of the character; -1 for nodes that
+    none turns."""
     rotations: Float[Tensor, "frame driver 3 3"]
     """G_s(j)(t) A_j R0_j of the driven nodes."""
     hips: int

@@ -141,7 +141,7 @@ class ViewScore:
     camera: str
     trained_on: bool
     psnr_db: float
-    """Of the whole view."""
+    """PSNR of the whole view."""
     lpips: float
     """LPIPS (AlexNet) in the subject's box."""
 

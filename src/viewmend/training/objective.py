@@ -61,7 +61,7 @@ class StepOutput:
 
 
 Validation = Callable[[nn.Module, Path], dict[str, float | None]]
-"""From the averaged model to its mean scores in dB, on fixed views that a run never trains on;
+"""Returns the averaged model's mean scores in dB, on fixed views that a run never trains on, and
 writes an image of the first views to the path."""
 
 

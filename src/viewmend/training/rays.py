@@ -45,9 +45,9 @@ class RayBatch:
     smallest_masks: Float[Tensor, "pixel point 4"]
     """Half precision."""
     window: UInt8[Tensor, "pixel 8 11 11"]
-    """In 255ths."""
+    """`RayInputs.window` in 255ths."""
     neighbourhoods: UInt8[Tensor, "neighbourhood 12 11 11"]
-    """In 255ths."""
+    """`RayInputs.neighbourhoods` in 255ths."""
     neighbourhood_index: Int[Tensor, "pixel"]
     """Index into `neighbourhoods` of each pixel."""
     truth: UInt8[Tensor, "pixel 3"]

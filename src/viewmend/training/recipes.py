@@ -29,8 +29,8 @@ SMALL_RIGS = SceneConfig(
 SUBJECT_SCENES = SceneConfig(
     sizes_px=(224, 320, 416, 576), num_holdout_views=5, imperfect_fraction=0.8, hard_fraction=0.5
 )
-"""Of `views` and `rays`. Each image size is at most 1.5 times the one before, so subjects of all
-sizes occur."""
+"""Scenes of `views` and `rays`. Each image size is at most 1.5 times the one before, so subjects of
+all sizes occur."""
 CAPTURE_SIZES_PX = (320, 576, 832)
 """Image sizes of fine-tuning, up to those of real cameras."""
 

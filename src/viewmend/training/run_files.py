@@ -46,7 +46,7 @@ class RunState:
     positions: tuple[ReplayPosition, ...]
     """Positions of all streams, in their order."""
     best_score: float | None = None
-    """Of the weights that are kept, in runs that keep the best."""
+    """Score of the weights that are kept, in runs that keep the best."""
     best_step: int = 0
 
 

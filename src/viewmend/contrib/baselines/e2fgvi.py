@@ -96,7 +96,10 @@ def pooled_places(grid: tuple[int, int]) -> tuple[Int[Tensor, "window key"], Boo
 
 
 def _around(count: int, size: int) -> tuple[Int[Tensor, "place neighbour"], Bool[Tensor, "place neighbour"]]:
-    """Along one axis: neighbours inside of it, enough of them for all, and which are at most size // 2 away."""
+    """Neighbours of each place along an axis, and whether they are at most size // 2 away.
+
+    All places have equally many neighbours, all of them inside the axis.
+    """
     at = torch.arange(count)[:, None]
     first = (at - size // 2).clamp(0, max(0, count - size))
     neighbours = first + torch.arange(min(size, count))

@@ -107,7 +107,7 @@ def _canvas(rgb: Image, missing: Bool[Tensor, "height width"], dilation_px: int)
 
 
 def _grid(length: int, side: int, overlap_px: int) -> list[tuple[int, int, int]]:
-    """Along one axis of the canvas: where each window starts, and where its part of the canvas starts and ends."""
+    """Start of each window along an axis of the canvas, and start and end of its part of the canvas."""
     count = 1 + math.ceil((length - side) / (side - overlap_px))
     starts = [round(i * (length - side) / max(count - 1, 1)) for i in range(count)]
     ends = [0, *((first + second + side) // 2 for first, second in pairwise(starts)), length]

@@ -76,7 +76,7 @@ class TokenBlock(nn.Module):
 
 
 class TokenTransformer(nn.Module, ABC):
-    """From frames with holes to whole frames; subclasses name the parts as the official checkpoints do."""
+    """Completes frames with holes; subclasses name the parts as the official checkpoints do."""
 
     encoder: nn.Module
     transformer: nn.ModuleList

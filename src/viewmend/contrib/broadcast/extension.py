@@ -130,11 +130,11 @@ class Broadcast(Extension):
         """What was sent, for /metrics."""
 
     def welcome_json(self) -> dict[str, Any]:
-        """As `Extension`."""
+        """See `Extension`."""
         return {"broadcast": True}
 
     def state_json(self, session: ViewerSession) -> dict[str, Any]:
-        """As `Extension`."""
+        """See `Extension`."""
         return {"on_air": self._director is session, "watched": self.is_watched}
 
     def handle(self, session: ViewerSession, message: Message) -> bool:
@@ -158,7 +158,7 @@ class Broadcast(Extension):
             self._director = None
 
     def metrics(self) -> list[str]:
-        """As `Extension`."""
+        """See `Extension`."""
         sent = {label(kind=kind): self.counts[kind] for kind in ("playlists", "segments")}
         return [
             *metric("viewmend_broadcast_watched", "gauge", "1 while it is watched.", int(self.is_watched)),
@@ -169,12 +169,12 @@ class Broadcast(Extension):
         ]
 
     def routes(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
-        """As `Extension`."""
+        """See `Extension`."""
         return {"/broadcast/{name}": self._file_response}
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """As `Extension`; ends the video."""
+        """Run as `Extension` says, and end the video afterwards."""
         try:
             yield
         finally:

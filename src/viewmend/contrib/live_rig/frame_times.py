@@ -52,7 +52,7 @@ class SenderTimes(ArrivalTimes):
         """Arrivals of the packets that FFmpeg still delays; None where the reader did not wait."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
-        """As `ArrivalTimes.add_packet`."""
+        """See `ArrivalTimes.add_packet`."""
         self._arrivals_s.append(arrived_s if waited else None)
         if len(self._arrivals_s) < (self._arrivals_s.maxlen or 0):
             return
@@ -61,7 +61,7 @@ class SenderTimes(ArrivalTimes):
             self._clock.add_packet(float(packet.dts * packet.time_base), own_arrival_s)
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """As `ArrivalTimes.taken_s`."""
+        """See `ArrivalTimes.taken_s`."""
         return None if frame.time is None else self._clock.to_local_s(frame.time)
 
 
@@ -69,7 +69,7 @@ class DriverTimes(SenderTimes):
     """The kernel's timestamps, which are on one of this machine's clocks if the driver is correct."""
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """As `ArrivalTimes.taken_s`."""
+        """See `ArrivalTimes.taken_s`."""
         monotonic_offset_s = 0.0
         wall_offset_s = time.time() - time.monotonic()
         for offset_s in (monotonic_offset_s, wall_offset_s):

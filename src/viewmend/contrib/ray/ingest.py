@@ -112,7 +112,7 @@ class Ingest:
         threading.Thread(target=self._lead, name="edge", daemon=True).start()
 
     def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
-        """As `IngestLink.state`."""
+        """See `IngestLink.state`."""
         source = self._source
         with self._changed:
             if watched:
@@ -135,7 +135,7 @@ class Ingest:
             )
 
     def frame(self, index: int, wait_s: float) -> tuple[str, Any] | None:
-        """As `IngestLink.frame`, with the reference that `put` returned instead of the frame."""
+        """See `IngestLink.frame`; returns the reference that `put` returned instead of the frame."""
         kept = self._find(index)
         if kept is not None:
             return kept

@@ -78,11 +78,11 @@ class IngestActor:
         self._ingest: Ingest | None = None
 
     def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
-        """As `Ingest.state`."""
+        """See `Ingest.state`."""
         return self._opened().state(known, wait_s, watched)
 
     def frame(self, index: int, wait_s: float) -> tuple[str, Any] | None:
-        """As `Ingest.frame`."""
+        """See `Ingest.frame`."""
         return self._opened().frame(index, wait_s)
 
     def _opened(self) -> Ingest:
@@ -105,11 +105,11 @@ class RayIngest:
         self._actor = actor
 
     def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
-        """As `IngestLink.state`."""
+        """See `IngestLink.state`."""
         return self._answer(self._actor.state.remote(known, wait_s, watched), wait_s)
 
     def frame(self, index: int, wait_s: float) -> tuple[str, SharedFrame] | None:
-        """As `IngestLink.frame`."""
+        """See `IngestLink.frame`."""
         found = self._answer(self._actor.frame.remote(index, wait_s), wait_s)
         return None if found is None else (found[0], self._answer(found[1][0], wait_s))
 
@@ -194,7 +194,7 @@ class StartWhenReady:
         self._ready = ready
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As ASGI specifies."""
+        """Serve a connection as an ASGI application."""
 
         async def send_when_ready(message: Message) -> None:
             if message["type"] == "lifespan.startup.complete":

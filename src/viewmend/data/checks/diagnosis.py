@@ -32,7 +32,7 @@ MIN_IMPROVEMENT = 0.1
 LONGEST_PX = 384
 """Images are reduced to this size."""
 MAX_CAMERAS_FOR_SWAPS = 24
-"""In larger rigs swapped pairs are not searched, since each pair needs a hull."""
+"""Swapped pairs are only searched in rigs of at most this many cameras: each pair needs a hull."""
 PAIRS_PX = 192
 """Swapped pairs are searched in images of at most this many pixels along their longer side."""
 PAIRS_HULL = HullConfig(resolution=48)

@@ -51,7 +51,7 @@ RESOLUTION_PX = 0.01
 SUSPECT_RATIO = 1.25
 """A camera is a suspect if the residual of its own outline is more than this many times the median."""
 MAX_SUSPECTS = 3
-"""At most this many suspects are tried."""
+"""The largest number of suspects that are tried."""
 MAX_LEFT = 0.5
 """A suspect is the outlier if at most this share of the residual remains without it."""
 AMBIGUOUS = 0.7

@@ -20,7 +20,7 @@ CALIBRATION = "calibration.json"
 TYPES = ("VCI", "VCI_REAL")
 MAX_META_BYTES = 2**16
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between OpenGL axes, which the program uses, and OpenCV axes, which its files use."""
+"""Converts between OpenGL axes, which the program uses, and OpenCV axes, which its files use."""
 Sixteen = Annotated[list[Number], Meta(min_length=16, max_length=16)]
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 

@@ -11,8 +11,8 @@ ENCODER_GROUPS = (1, 1, 1, 1, 1, 2, 4, 8, 1)
 SMALL_WIDTHS = (16, 16, 32, 64, 96, 128, 96, 64, 32)
 """Encoder widths of `paper_small`: a quarter of the paper's."""
 PAPER_TOP_K = 512
-"""About an eighth of the tokens of a whole window of three cameras at 512 pixels; 0.00 dB below all
-in the ablation."""
+"""Tokens kept by pruning: about an eighth of a whole window of three cameras at 512 pixels, with
+0.00 dB less than all of them in the ablation."""
 MAX_SIZE = 65_536
 """The largest accepted size, so that a damaged config cannot request an absurd allocation."""
 MAX_BLOCKS = 256

@@ -24,7 +24,7 @@ from viewmend.models.paper.transformer import Transformer
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 
 Contexts = Sequence[Sequence[ContextFrame | ContextViews]]
-"""Per view, encoded frames and camera images."""
+"""Encoded frames and camera images of each view."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""From images to tokens (sections 3 and 4), and from tokens to pixels, patch by patch (section 7)."""
+"""Turns images into tokens (sections 3 and 4), and tokens into pixels, patch by patch (section 7)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -57,7 +57,7 @@ class DepthDistribution(NamedTuple):
     depth: Float[Tensor, "rows columns"]
     """The proxy's nearest z-depth in each cell, metres; 0 where there is no cell."""
     logits: Float[Tensor, "cell sample"]
-    """Of the surface being at each depth hypothesis."""
+    """Logits of the surface being at each depth hypothesis."""
     samples: AggregatedSamples
     cameras: Int[Tensor, "cell view"] | None
     """Indices of the source cameras that were sampled in each cell; None for all."""
@@ -105,7 +105,7 @@ class ViewPrediction(NamedTuple):
 
     pixels: Pixels
     rgb: Float[Tensor, "pixel 3"]
-    """In [0, 1], on black."""
+    """Colours in [0, 1], on black."""
     alpha: Float[Tensor, "pixel"]
     confidence: Float[Tensor, "pixel"]
     """Probability that no channel is off by more than a tenth."""

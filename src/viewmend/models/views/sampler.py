@@ -41,7 +41,7 @@ class Rays(NamedTuple):
     view: IncompleteView
     """The novel view, or a crop of it."""
     scale: SceneScale
-    """Of the whole view."""
+    """The scale of the whole view."""
     uv_px: Float[Tensor, "ray 2"]
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""

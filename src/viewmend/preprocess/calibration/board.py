@@ -23,7 +23,7 @@ ALONG = 0.42
 CLEAR_PX = 0.8
 """Pixels closer to a marker than this, pixels, are not used."""
 LEAST_CLEAR = 0.35
-"""At least this share of the gap between corner and marker is used."""
+"""The smallest fraction of the gap between corner and marker that is used."""
 BLUR_PX = 0.5
 """The search begins with edges this soft: the scale of the hyperbolic tangent, pixels."""
 BLURS_PX = (0.3, 2.0)

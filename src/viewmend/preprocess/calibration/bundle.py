@@ -56,7 +56,7 @@ class CalibratedCamera:
     corners: Float64[np.ndarray, "corner 2"]
     """Where corners were found, pixels."""
     off: Float64[np.ndarray, "corner 2"]
-    """From there to where the calibration has them, pixels."""
+    """Residuals in pixels: projections of the corners minus where they were found."""
 
     @property
     def rms_px(self) -> float:
@@ -161,7 +161,7 @@ class _Rows:
         self.time = np.repeat([times.index(time) for _, time in keys], counts)
 
     def residuals(self, x: Float64[np.ndarray, "parameter"]) -> Float64[np.ndarray, "residual"]:
-        """From where corners were found to where they are projected, pixels; at the end the prior's."""
+        """Reprojection errors of all corners in pixels, followed by the residuals of the prior."""
         camera, pose = self._split(x)
         turns = Rotation.from_rotvec(pose[:, :3]).as_matrix()[self.time]
         world = np.einsum("pij,pj->pi", turns, self.points) + pose[self.time, 3:]

@@ -266,7 +266,7 @@ class HeldOutIou:
     before: float
     """Intersection over union of its silhouette and the mask, with the cameras as given."""
     after: float
-    """With the others refined by their masks alone; the camera itself is as it was."""
+    """The same, with the other cameras refined by their masks alone and this camera unchanged."""
 
 
 def refined_without(

@@ -48,7 +48,10 @@ def agreed(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
 
 
 def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tuple[Inside, Inside] | None]:
-    """In each camera, silhouettes of the hulls of any group of the others (dilated) and of all; None without a hull."""
+    """Yield silhouettes of hulls in each camera: of groups of the others (dilated), and of all.
+
+    None without a hull.
+    """
     small, small_cameras = _reduced(mask, cameras)
     there = [view for view in range(len(cameras)) if bool((small[view] > FOREGROUND).any())]
     for view, size_px in enumerate(cameras.size_px.tolist()):

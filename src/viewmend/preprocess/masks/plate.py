@@ -81,7 +81,7 @@ def _length(difference: Colours) -> Values:
 
 
 def _smooth(rgb: Rgb) -> Colours:
-    """In [0, 1], without the noise of single pixels."""
+    """Convert to floats in [0, 1], without the noise of single pixels."""
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.float32) / 255
 
 
@@ -145,7 +145,7 @@ def plates_from_frames(source: CaptureSource, times: range) -> dict[str, Rgb]:
 
 
 def spread(times: range) -> range:
-    """At most `MOST_FRAMES` of these times, evenly spread."""
+    """Select at most `MOST_FRAMES` of these times, evenly spread."""
     return times[:: -(-len(times) // MOST_FRAMES)]
 
 

@@ -237,7 +237,7 @@ class Outfit:
     fabrics: tuple[Fabric, Fabric, Fabric]
     """Fabrics of top, bottom and outer."""
     lettering: str
-    """Across the chest; empty for none."""
+    """Text across the chest; empty for none."""
     shoes: Float[np.ndarray, "2 3"]
     """Upper and sole, sRGB."""
     seed: int

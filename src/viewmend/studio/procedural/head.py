@@ -29,7 +29,7 @@ class Head:
 
     person: Physique
     origin: Vector
-    """Below the ears at chin height, world metres."""
+    """The point below the ears at chin height, world metres."""
     size_m: float
 
     def radius(self, azimuth: Values, y: Values) -> Values:

@@ -45,7 +45,7 @@ class Score:
 
     @property
     def turn(self) -> Rotation:
-        """To the heading."""
+        """The rotation about y to the heading."""
         return rotation(1, self.heading)
 
     def rest(self, width: float, drop: float, ahead_m: float = 0.0) -> Stance:
