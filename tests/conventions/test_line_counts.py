@@ -9,13 +9,13 @@ from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file,
 CEILINGS = {
     "parallel": 122,
     "walruses": 82,
-    "prepositions": 99,
+    "prepositions": 4,
     "late_constants": 49,
     "statements": 3,
     "locals": 33,
 }
 """The most of each pattern in the package."""
-MAX_LONG_LINES_PERCENT = 1.7
+MAX_LONG_LINES_PERCENT = 1.6
 """The most lines over 110 columns, per cent of the non-blank lines."""
 
 
