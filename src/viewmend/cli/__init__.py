@@ -23,6 +23,9 @@ from viewmend import __version__
 from viewmend.cli.console import escape_unencodable, exit_on_sigterm, say, show
 from viewmend.utils.logging import escaped_traceback, log_to_terminal
 
+ALIASES = {"info": "check"}
+"""Former names of commands. They still work, but the overview does not list them."""
+
 
 class Command(NamedTuple):
     """A subcommand. Its name is one or two words; `weights get` is matched before `weights`."""
@@ -62,9 +65,6 @@ COMMANDS = (
     Command("export", "viewmend.cli.export", "Export a model for C++ and other runtimes."),
     Command("check", "viewmend.cli.check", "Check a capture, and describe it."),
 )
-
-ALIASES = {"info": "check"}
-"""Former names of commands. They still work, but the overview does not list them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

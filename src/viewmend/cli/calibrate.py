@@ -9,6 +9,8 @@ import tyro
 if TYPE_CHECKING:
     from viewmend.geometry.bounds import Bounds
     from viewmend.types import MultiViewFrame
+Figures = dict[str, dict[str, int | float]]
+"""Numbers of each camera, by the camera's name and the number's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +68,6 @@ def run(options: Options) -> int:
         )
     say(f"wrote {options.out}")
     return 0
-
-
-Figures = dict[str, dict[str, int | float]]
 
 
 def _by_board(options: Options, out: Path) -> Figures:

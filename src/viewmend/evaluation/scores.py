@@ -34,6 +34,12 @@ Features = dict[str, Float[np.ndarray, "clip 1024"]]
 """I3D's feature vectors of the videos of a stream, for each of `KINDS`."""
 ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
 """score(image, truth): a value for each pixel, NaN where undefined; None for images that are too small."""
+NETWORKS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "lpips-alex": ("lpips_alex", lambda device: load_lpips("alex", device).map),
+    "lpips-vgg": ("lpips_vgg", lambda device: load_lpips("vgg", device).map),
+    "i3d": ("i3d", load_i3d),
+}
+"""Networks of metrics: the field of `Scorers`, and the function that loads them."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +52,6 @@ class Scorers:
     lpips_alex: ScoreMap | None = None
     lpips_vgg: ScoreMap | None = None
     i3d: I3d | None = None
-
-
-NETWORKS: dict[str, tuple[str, Callable[[str], object]]] = {
-    "lpips-alex": ("lpips_alex", lambda device: load_lpips("alex", device).map),
-    "lpips-vgg": ("lpips_vgg", lambda device: load_lpips("vgg", device).map),
-    "i3d": ("i3d", load_i3d),
-}
-"""Networks of metrics: the field of `Scorers`, and the function that loads them."""
 
 
 def load_scorers(background: Background, ssim: SsimWindow, networks: Sequence[str], device: str) -> Scorers:

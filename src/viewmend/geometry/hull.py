@@ -37,6 +37,8 @@ NEAR_M = 1e-6
 SAMPLES = 1 << 24
 """Cameras are carved together on a device as long as their voxels are no more than this, which
 bounds the memory."""
+Box = tuple[slice, slice, slice]
+"""The first cell along x, y and z, and the one after the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +69,6 @@ class HullConfig:
     least_fraction: float = 0.25
     """Points seen by a smaller share of the cameras count as empty, however many are cut off, if
     `min_fraction` is not lower."""
-
-
-Box = tuple[slice, slice, slice]
-"""The first cell along x, y and z, and the one after the last."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from functools import cache
 
 import torch
 
+_torch = threading.local()
+
 
 def parallel_for(work: Callable[[int], object], count: int) -> None:
     """Call `work(0)` to `work(count - 1)` on as many threads as torch may use; `work` must release the GIL to gain.
@@ -32,9 +34,6 @@ def parallel_for(work: Callable[[int], object], count: int) -> None:
         for other in others:
             if not other.cancel():
                 other.result()
-
-
-_torch = threading.local()
 
 
 @contextmanager

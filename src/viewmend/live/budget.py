@@ -41,6 +41,8 @@ MIN_MEASURED_PX = 20_000
 """Smaller images are not measured: most of their time does not depend on resolution."""
 DEFAULT_S_PER_PX = 6e-6
 """Seconds per pixel at full quality before any measurement, as on a slow machine."""
+SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
+"""Scales of the resolution, from the cheapest level up."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,6 @@ class Ladder:
     """The level of a view that has just come to rest: sharp and quickly rendered."""
 
 
-SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
 CONTEXT_LADDER = Ladder(
     (
         *(QualityLevel(scale, 0, 256) for scale in SCALES),

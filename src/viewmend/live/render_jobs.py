@@ -34,6 +34,8 @@ TURNTABLE_VIEWS = 25
 SOURCE_QUALITY = 90
 """JPEG quality of the cameras' own images."""
 Result = TypeVar("Result")
+NameList = Annotated[str, Meta(max_length=4096)]
+"""Names of cameras, separated by commas."""
 
 
 class ViewOptions(Struct, frozen=True, kw_only=True):
@@ -47,10 +49,6 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     background: protocol.Colour | None = None
     model: protocol.Model | None = None
     """See `protocol.Look`."""
-
-
-NameList = Annotated[str, Meta(max_length=4096)]
-"""Names of cameras, separated by commas."""
 
 
 class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):

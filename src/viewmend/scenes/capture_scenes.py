@@ -23,6 +23,16 @@ from viewmend.rendering.view import select_closest
 from viewmend.scenes.held_out import LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.utils.untrusted_input import bounded_bytes, read_json, typed
 
+FORMAT = "viewmend-splits/1"
+"""Name and version of the file of splits."""
+CLOSEST = 3
+"""Number of source cameras that colour the view of a held-out camera."""
+_PROTOCOL = (
+    "No subject is in both splits. Of each scene one camera, left_out, is used for nothing but the truth. "
+    "Its view is coloured by the 3 others that are closest in angle at the subject; the hull is of all others."
+)
+"""Explains the file of splits to those who read it without this program."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureScene(LeaveOneOutScene):
@@ -128,10 +138,6 @@ def _fingerprint(folder: Path, format: str | None) -> str:
             [(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]
         ).encode()
     return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()
-
-
-FORMAT = "viewmend-splits/1"
-CLOSEST = 3
 
 
 class SplitScene(Struct, frozen=True, kw_only=True):
@@ -261,12 +267,6 @@ def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple
                 f"got another, {now[:12]}; take that version of the data, or make splits of your own"
             )
         yield scene, path
-
-
-_PROTOCOL = (
-    "No subject is in both splits. Of each scene one camera, left_out, is used for nothing but the truth. "
-    "Its view is coloured by the 3 others that are closest in angle at the subject; the hull is of all others."
-)
 
 
 def _scene(path: Path, base: Path, seed: int, subject: str, format: str | None) -> SplitScene:

@@ -57,6 +57,21 @@ MARGIN_PX = 4
 BODY_SHARE = 0.25
 """Textures of which less than this lies neither on the head nor on the hands are hair, hats,
 glasses, gloves."""
+CHART = Canvas(1.4, 1.65, 250.0)
+"""Canvas of a flat cloth: around the trunk with 0 in front, and from the soles to the collar."""
+CHEST_M = 1.22
+"""Height of lettering above the soles, metres."""
+FOLDS = 0.12
+"""Lightness that is added to both sides of the ratio that keeps folds: black cloth would be all
+noise."""
+_DYED = 0.3
+"""Fraction of garments that are dyed instead of replaced; shoes always are."""
+_ONE_PIECE = 0.4
+"""Fraction of overalls that stay in one piece; the others become a top and trousers."""
+_LETTERED = 0.4
+"""Fraction of quietly patterned tops with text across the chest."""
+_GRAY = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue in luma (BT.601)."""
 
 
 @dataclass(frozen=True)
@@ -262,20 +277,6 @@ def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
         around[at] = np.median(np.hypot(x, z)) * np.arctan2(x, z)
         along[at] = y + np.float32(SHOULDER_M if "arm" in name else top[1] - floor)
     return around, along
-
-
-CHART = Canvas(1.4, 1.65, 250.0)
-"""One cloth, flat: around the trunk with 0 in front, and from the soles to the collar."""
-CHEST_M = 1.22
-"""Height of lettering."""
-FOLDS = 0.12
-"""Added to lightness before the ratio that folds are: black cloth would be all noise."""
-_DYED = 0.3
-"""Share of garments that are dyed instead of replaced; shoes always are."""
-_ONE_PIECE = 0.4
-"""Share of overalls that stay in one piece; the others become a top and trousers."""
-_LETTERED = 0.4
-_GRAY = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def vary_cloth(

@@ -28,6 +28,13 @@ MAX_TEXELS = 2**26
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, struct.error)
+"""Errors that indices, types and shapes raise which do not fit one another."""
+MAX_VERTICES = 20_000_000
+"""Largest number of vertices of all parts, each counted once for every node that uses it."""
+HEAVIEST = 65535.0
+"""Largest accepted skinning weight. Weights are divided by their sum, so 16-bit integers are
+fine."""
 
 
 @dataclass(frozen=True)
@@ -184,14 +191,6 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-
-
-MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, struct.error)
-"""What indices, types and shapes raise that do not fit one another."""
-MAX_VERTICES = 20_000_000
-"""Vertices of all parts, each counted where it stands."""
-HEAVIEST = 65535.0
-"""Weights are divided by their sum, so that whole numbers of 16 bit will do; what is heavier is none."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ SHADOW_DISTANCE_M = 12.0
 SHADOW_BIAS_M = 0.015
 GLOSS_DOUBLINGS = 4
 """Highlights fall off with the power 2^this of the half vector's cosine: a power that needs no logarithm."""
+BANDS = 4
+"""Number of bands of rows that threads share."""
 
 
 @dataclass(frozen=True)
@@ -129,10 +131,6 @@ def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height 
     share = torch.sigmoid((upward + 0.15) * 12)[:, None]
     wall, floor = (c.to(pixels)[None, :, None] for c in (wall, floor))
     return ((floor + (wall - floor) * share) * (0.9 + 0.2 * upward[:, None])).unflatten(-1, (height, width))
-
-
-BANDS = 4
-"""Bands of rows that threads share."""
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,12 @@ _SKIP = (
     "ik",
 )
 
+_LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
+"""Limbs whose rest directions are aligned, and the part that each points to; hands turn
+with their forearms."""
+Rest = Mapping[str, Float[Tensor, "3"]]
+"""Part -> position of its joint in a rest pose."""
+
 
 def family_table(family: str) -> dict[str, str]:
     """Part -> joint name of a known family: acclaim, cgspeed, humanik, mixamo, rigify or mannequin."""
@@ -158,14 +164,6 @@ def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
         picks = [("Spine", spine[0]), ("Spine2", spine[-1]), ("Spine1", spine[len(spine) // 2])][: len(spine)]
         chosen |= {part: name for part, name in picks if name not in chosen.values()}
     return {part: name for part, name in chosen.items() if name is not None}
-
-
-_LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
-"""Limbs whose rest directions are aligned, and the part that each points to; hands turn
-with their forearms."""
-
-Rest = Mapping[str, Float[Tensor, "3"]]
-"""Part -> position of its joint in a rest pose."""
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,9 @@ TILE_PX = 256
 SHOWN_VIEWS = 8
 """Views in the image of a validation."""
 Model = TypeVar("Model", bound=nn.Module)
+Validation = Callable[[nn.Module, Path], dict[str, float | None]]
+"""Returns the averaged model's mean scores in dB, on fixed views that a run never trains on, and
+writes an image of the first views to the path."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,6 @@ class StepOutput:
     """The weighted sum of all terms except L_adv."""
     judged: Judged | None = None
     """The batch for the discriminator, if the objective has one."""
-
-
-Validation = Callable[[nn.Module, Path], dict[str, float | None]]
-"""Returns the averaged model's mean scores in dB, on fixed views that a run never trains on, and
-writes an image of the first views to the path."""
 
 
 class Objective(nn.Module, Generic[Model]):

@@ -33,6 +33,17 @@ SUBJECT_SCENES = SceneConfig(
 all sizes occur."""
 CAPTURE_SIZES_PX = (320, 576, 832)
 """Image sizes of fine-tuning, up to those of real cameras."""
+BASELINES = ("dstt", "fuseformer", "e2fgvi", "e2fgvi-hq")
+"""Published networks; their recipe takes the network's name."""
+RECIPES: dict[str, str] = {
+    "views": "viewmend.training.recipes:views",
+    "rays": "viewmend.training.recipes:rays",
+    "paper": "viewmend.training.recipes:paper",
+    "paper-small": "viewmend.training.recipes:paper_small",
+    "finetune": "viewmend.training.recipes:finetune",
+    **dict.fromkeys(BASELINES, "viewmend.contrib.baselines.training:recipe"),
+}
+"""MODULE:NAME of the function that makes each recipe; a module is imported when its recipe is requested."""
 
 
 def views() -> TrainConfig:
@@ -150,19 +161,6 @@ def finetune(start: str = "views") -> TrainConfig:
         checkpoint_minutes=2.0,
         validate_every=60,
     )
-
-
-BASELINES = ("dstt", "fuseformer", "e2fgvi", "e2fgvi-hq")
-"""Published networks; their recipe takes the network's name."""
-RECIPES: dict[str, str] = {
-    "views": "viewmend.training.recipes:views",
-    "rays": "viewmend.training.recipes:rays",
-    "paper": "viewmend.training.recipes:paper",
-    "paper-small": "viewmend.training.recipes:paper_small",
-    "finetune": "viewmend.training.recipes:finetune",
-    **dict.fromkeys(BASELINES, "viewmend.contrib.baselines.training:recipe"),
-}
-"""MODULE:NAME of the function that makes each recipe; a module is imported when its recipe is requested."""
 
 
 def make_recipe(name: str, start: str | None = None) -> TrainConfig:

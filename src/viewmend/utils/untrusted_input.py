@@ -15,6 +15,26 @@ MOST_CHARACTERS = 1000
 """Maximum length of an error message, which may quote arbitrary input."""
 ENDING = 300
 """Characters kept from the end of a longer message, which names the next step."""
+Kind = TypeVar("Kind")
+"""The type that a message is parsed as."""
+FINITE = 1e300
+"""Largest magnitude of a number that is accepted."""
+Number = Annotated[float, Meta(ge=-FINITE, le=FINITE)]
+"""A finite number."""
+Triple = tuple[Number, Number, Number]
+MOST_PARTS = 2**20
+"""Maximum number of lists and objects (counted as brackets); ten thousand cameras need a twentieth of it."""
+LARGEST_INTEGER = 2**53
+"""Largest integer that JavaScript represents exactly."""
+PLAIN_NAMES = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "an object of keys",
+}
+"""Names of JSON types in messages."""
 
 
 class InputError(ValueError):
@@ -46,27 +66,6 @@ def file_sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-Kind = TypeVar("Kind")
-
-FINITE = 1e300
-Number = Annotated[float, Meta(ge=-FINITE, le=FINITE)]
-"""A finite number."""
-Triple = tuple[Number, Number, Number]
-MOST_PARTS = 2**20
-"""Maximum number of lists and objects (counted as brackets); ten thousand cameras need a twentieth of it."""
-LARGEST_INTEGER = 2**53
-"""Largest integer that JavaScript represents exactly."""
-PLAIN_NAMES = {
-    "int": "a whole number",
-    "float": "a number",
-    "str": "a text",
-    "bool": "true or false",
-    "array": "a list",
-    "object": "an object of keys",
-}
-"""Names of JSON types in messages."""
 
 
 def one_of(*words: str) -> Meta:

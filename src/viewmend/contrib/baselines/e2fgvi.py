@@ -27,6 +27,8 @@ WINDOW = (5, 9)
 """Rows and columns of tokens in a window."""
 REACH = (WINDOW[0] // 2, WINDOW[1] // 2)
 """How far around a window its surroundings reach, in tokens; and around a pooled token, in windows."""
+MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
+"""Height and width of one attention window: 60 x 108."""
 
 
 class FocalAttention(nn.Module):
@@ -104,10 +106,6 @@ def _around(count: int, size: int) -> tuple[Int[Tensor, "place neighbour"], Bool
     first = (at - size // 2).clamp(0, max(0, count - size))
     neighbours = first + torch.arange(min(size, count))
     return neighbours, (neighbours - at).abs() <= size // 2
-
-
-MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
-"""Height and width of one attention window: 60 x 108."""
 
 
 @dataclass(frozen=True)

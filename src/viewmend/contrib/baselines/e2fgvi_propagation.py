@@ -20,6 +20,14 @@ MULTIPLE = 2 ** (LEVELS - 1)
 """Sizes that halve at each level."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+GROUPS = 16
+"""Number of channel groups with offsets of their own."""
+POINTS = 9
+"""Number of points of a 3 x 3 kernel."""
+REACH_PX = 10.0
+"""Largest displacement of a kernel point from the flow's target, pixels."""
+Feature = Float[Tensor, "sample channel height width"]
+Flow = Float[Tensor, "sample 2 height width"]
 
 
 def warp(
@@ -126,17 +134,6 @@ def deform_conv2d(
     out = weight.flatten(1) @ rearrange(read, "b g c k n -> b (g c k) n").to(weight.dtype)
     out = rearrange(out, "b o (h w) -> b o h w", h=height)
     return out if bias is None else out + bias.view(-1, 1, 1)
-
-
-GROUPS = 16
-"""Groups of channels with offsets of their own."""
-POINTS = 9
-"""Points of a 3 x 3 kernel."""
-REACH_PX = 10.0
-"""Largest displacement of a kernel point from the flow's target."""
-
-Feature = Float[Tensor, "sample channel height width"]
-Flow = Float[Tensor, "sample 2 height width"]
 
 
 class AlignedConvolution(nn.Module):

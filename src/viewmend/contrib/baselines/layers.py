@@ -14,6 +14,18 @@ STRIDE_PX = 4
 """Pixels per feature cell."""
 SHALLOW, FEATURES = 256, 128
 """Channels after the first four convolutions (input of all later ones, too) and at the end."""
+PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
+"""Patches are 7 x 7 feature cells, one every 3, with 3 cells of zeros around the map."""
+STEP_PX = STRIDE_PX * STEP_CELLS
+"""Pixels from token to token."""
+DIM = 512
+"""Channels of a token."""
+FUSION_CHANNELS = 40
+"""Channels of the map in which the fusion feed-forward lets neighbouring patches mix."""
+FeatureMaps = Float[Tensor, "frame 128 height width"]
+"""Features of frames, at a quarter of their size."""
+Tokens = Float[Tensor, "frame rows cols 512"]
+"""Tokens in the grid of their patches: ceil(height / 3) x ceil(width / 3) of a feature map."""
 
 
 class HierarchicalEncoder(nn.Module):
@@ -106,21 +118,6 @@ def with_skips(
             features = torch.cat(split, 2).flatten(1, 2)
         features = layer(features)
     return features
-
-
-PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
-"""Patches are 7 x 7 feature cells, one every 3, with 3 cells of zeros around the map."""
-STEP_PX = STRIDE_PX * STEP_CELLS
-"""Pixels from token to token."""
-DIM = 512
-"""Channels of a token."""
-FUSION_CHANNELS = 40
-"""Channels of the map in which the fusion feed-forward lets neighbouring patches mix."""
-
-FeatureMaps = Float[Tensor, "frame 128 height width"]
-"""Features of frames, at a quarter of their size."""
-Tokens = Float[Tensor, "frame rows cols 512"]
-"""Tokens in the grid of their patches: ceil(height / 3) x ceil(width / 3) of a feature map."""
 
 
 def token_grid(height: int, width: int) -> tuple[int, int]:

@@ -31,6 +31,16 @@ FlowMap = Float[Tensor, "2 height width"]
 DISAGREEMENT = (0.01, 0.5)
 """Forward and backward flow may differ, squared, by this fraction of their squares plus this many
 square pixels."""
+RAFT_CELL_PX = 8
+"""Sides of RAFT's input are multiples of this."""
+RAFT_MIN_PX, RAFT_MAX_PX = 128, 864
+"""Sides of RAFT's input: the coarsest correlation needs 128 px; RGVI uses 480 x 864."""
+PAST_FRAMES = 10
+"""Number of past frames that are kept."""
+FLOW_MARGIN_PX = 4
+"""Flow this near to a hole depends on the fill, and is completed, too."""
+Flow = Callable[[Image, Image], FlowMap]
+"""flow(image, other), of images in [0, 1]."""
 
 
 def dis_flow(image: Image, other: Image) -> FlowMap:
@@ -69,12 +79,6 @@ def disagreeing(flow: FlowMap, back: FlowMap) -> Bool[Tensor, "height width"]:
     return ~inside | ((flow + returned).square().sum(0) > allowed)
 
 
-RAFT_CELL_PX = 8
-"""Sides of RAFT's input are multiples of this."""
-RAFT_MIN_PX, RAFT_MAX_PX = 128, 864
-"""Sides of RAFT's input: the coarsest correlation needs 128 px; RGVI uses 480 x 864."""
-
-
 @torch.inference_mode()
 def raft_flow(network: nn.Module, image: Image, other: Image) -> FlowMap:
     """Where the image's pixels are in the other one, by torchvision's RAFT (large); images in [0, 1], of any size."""
@@ -84,15 +88,6 @@ def raft_flow(network: nn.Module, image: Image, other: Image) -> FlowMap:
     pair = interpolate(torch.stack([image, other]) * 2 - 1, size, mode="bilinear", antialias=True)
     flow = interpolate(network(pair[:1], pair[1:])[-1], (height, width), mode="bilinear")[0]
     return flow * flow.new_tensor([width / size[1], height / size[0]])[:, None, None]
-
-
-PAST_FRAMES = 10
-"""Number of past frames that are kept."""
-FLOW_MARGIN_PX = 4
-"""Flow this near to a hole depends on the fill, and is completed, too."""
-
-Flow = Callable[[Image, Image], FlowMap]
-"""flow(image, other), of images in [0, 1]."""
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,13 @@ Clips = Float[Tensor, "sample frame 3 height width"]
 """Frames in [-1, 1], 0 in the holes."""
 TokenClips = Float[Tensor, "sample frame rows cols 512"]
 """Tokens of clips in the grid of their patches."""
+ZONES = 2
+"""Temporal attention stays within a zone; a frame has ZONES x ZONES."""
+HIDDEN = 2048
+"""Channels of DSTT's feed-forward layers."""
+SIZE_STEP_PX = STEP_PX * ZONES
+"""Heights and widths are multiples of this, so that zones are equal."""
+TOKENS = token_grid(*CELLS)
 
 
 class MultiHeadAttention(nn.Module):
@@ -129,13 +136,6 @@ def initialise(network: nn.Module) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-ZONES = 2
-"""Temporal attention stays within a zone; a frame has ZONES x ZONES."""
-HIDDEN = 2048
-SIZE_STEP_PX = STEP_PX * ZONES
-"""Heights and widths are multiples of this, so that zones are equal."""
-
-
 class DecoupledBlock(TokenBlock):
     """Attention over all frames within each zone (`temporal`), or over all tokens of each frame.
 
@@ -193,9 +193,6 @@ class DSTT(TokenTransformer):
     def compose(self, tokens: Tokens, size: tuple[int, int]) -> FeatureMaps:
         """See `TokenTransformer.compose`."""
         return self.vec2patch(tokens, size)
-
-
-TOKENS = token_grid(*CELLS)
 
 
 class JointBlock(TokenBlock):

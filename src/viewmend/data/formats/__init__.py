@@ -39,6 +39,11 @@ from viewmend.data.native_format import (
     read_calibration,
 )
 
+_DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
+_TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
+SESSIONS = ("pose2sim", "qualisys")
+"""Formats whose calibration may lie in a folder next to that of the recording, or one level higher."""
+
 
 @dataclass(frozen=True)
 class Format:
@@ -50,8 +55,6 @@ class Format:
     """The folder that the paths in the content are relative to."""
 
 
-_DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
-_TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
 FORMATS = {
     module.__name__.rpartition(".")[2]: Format(
         module.find, module.content, getattr(module, "root", Format.root)
@@ -60,10 +63,6 @@ FORMATS = {
 }
 """All formats but our own, in the order in which they are tried."""
 FORMAT_NAMES = ("plain", *FORMATS)
-
-
-SESSIONS = ("pose2sim", "qualisys")
-"""Formats whose calibration may lie in a folder next to that of the recording, or one level higher."""
 
 
 def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:

@@ -14,6 +14,9 @@ from viewmend.models.paper.patches import centers_px, reproject
 from viewmend.models.paper.transformer import TokenPositions
 from viewmend.types import IncompleteView
 
+Positions = tuple[Float[Tensor, "_patch 3"], Bool[Tensor, "_patch"]]
+"""(u, v, s) of patches, and which of them are valid."""
+
 
 @dataclass(frozen=True)
 class ContextFrame:
@@ -56,10 +59,6 @@ def window_times(time: int, config: PaperConfig) -> tuple[int, ...]:
     near = range(time, time - config.n_c - 1, -1)
     far = (time - config.k_w * j for j in range(1, config.n_w + 1))
     return tuple(sorted({t for t in (*near, *far) if t >= 0}, reverse=True))
-
-
-Positions = tuple[Float[Tensor, "_patch 3"], Bool[Tensor, "_patch"]]
-"""(u, v, s) of patches, and which of them are valid."""
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,8 @@ OUTLIER_PX = 1.5
 
 Grey = UInt8[np.ndarray, "height width"]
 Points = Float64[np.ndarray, "point 2"]
+LEAST_CORNERS = 8
+"""Images with fewer corners are ignored."""
 
 
 def refined(grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float) -> Points:
@@ -119,10 +121,6 @@ def _fitted(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndar
 def _mapped(matrix: Float64[np.ndarray, "3 3"], points: Points) -> Points:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
-
-
-LEAST_CORNERS = 8
-"""Images with fewer corners are ignored."""
 
 
 @dataclass(frozen=True)

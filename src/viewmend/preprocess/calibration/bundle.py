@@ -42,6 +42,9 @@ Matrix = Float64[np.ndarray, "3 3"]
 Distortion = Float64[np.ndarray, "5"]
 Pose = Float64[np.ndarray, "4 4"]
 Picture = UInt8[np.ndarray, "height width 3"]
+ENLARGED = 100
+"""Scale at which residuals are drawn."""
+TILE_PX = 480
 
 
 @dataclass(frozen=True)
@@ -206,11 +209,6 @@ class _Rows:
     def _split(self, x: Float64[np.ndarray, "parameter"]) -> tuple[np.ndarray, np.ndarray]:
         end = CAMERA * self.views
         return x[:end].reshape(self.views, CAMERA), x[end:].reshape(self.times, POSE)
-
-
-ENLARGED = 100
-"""Scale at which residuals are drawn."""
-TILE_PX = 480
 
 
 def with_cameras(calibration: NativeCalibration, cameras: Cameras) -> NativeCalibration:

@@ -27,6 +27,32 @@ from viewmend.geometry.rigid import invert_rigid, rigid
 from viewmend.types import MultiViewFrame
 
 Places = Float64[np.ndarray, "point 3"]
+LEAST_CAMERAS = 3
+"""Fewer cameras do not constrain each other: two masks always have common points."""
+CAMERA = 7
+"""Parameters of a camera: rotation, translation, focal length; each in pixels that it moves what is seen."""
+HOLDS = (1e-3, 0.1)
+"""Strength of the prior on the present cameras, since outlines do not determine everything. The
+second value is for few frames and hard masks; held-out cameras decide which is better."""
+SEARCHES = 6
+"""The best places on the lines of sight are searched at most this many times."""
+STEPS = 6
+"""The cameras move in at most this many steps between two searches."""
+ENOUGH = 0.02
+"""The steps end when one reduces the residual by less than this share."""
+DAMPING = 1e-3
+"""The damping of Levenberg and Marquardt begins with this value."""
+MOST_DAMPING = 1e4
+"""The steps end when the damping of Levenberg and Marquardt exceeds this value."""
+Moves = Float64[np.ndarray, "view parameter"]
+Depths = list[Float64[np.ndarray, "_point"]]
+"""The z-depth of each line of sight's place, for each time."""
+LEFT_OUT = 3
+"""Number of cameras that are held out in turn, spread over the rig."""
+LEFT_OUT_TIMES = 2
+"""Number of frames that are held out in turn, if there are several."""
+MARGIN = 0.1
+"""How much larger than the hull the box is that may hold the subject, to each side."""
 
 
 def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
@@ -57,29 +83,6 @@ def _similarity(
     R = (u * sign) @ vt
     scale = float((s * sign).sum() / (a**2).sum())
     return R, target.mean(0) - scale * R @ source.mean(0), scale
-
-
-LEAST_CAMERAS = 3
-"""Fewer cameras do not constrain each other: two masks always have common points."""
-CAMERA = 7
-"""Parameters of a camera: rotation, translation, focal length; each in pixels that it moves what is seen."""
-HOLDS = (1e-3, 0.1)
-"""Strength of the prior on the present cameras, since outlines do not determine everything. The
-second value is for few frames and hard masks; held-out cameras decide which is better."""
-SEARCHES = 6
-"""The best places on the lines of sight are searched at most this many times."""
-STEPS = 6
-"""The cameras move in at most this many steps between two searches."""
-ENOUGH = 0.02
-"""The steps end when one reduces the residual by less than this share."""
-DAMPING = 1e-3
-"""The damping of Levenberg and Marquardt begins with this value."""
-MOST_DAMPING = 1e4
-"""The steps end when the damping of Levenberg and Marquardt exceeds this value."""
-
-Moves = Float64[np.ndarray, "view parameter"]
-Depths = list[Float64[np.ndarray, "_point"]]
-"""The z-depth of each line of sight's place, for each time."""
 
 
 @dataclass(frozen=True)
@@ -248,14 +251,6 @@ def _by_camera(
     place = np.broadcast_to(place, by_place.shape)
     by_focal = (by_place[..., :2] * place[..., :2]).sum(-1, keepdims=True)
     return np.concatenate([np.cross(place, by_place), by_place, by_focal], -1)
-
-
-LEFT_OUT = 3
-"""Number of cameras that are held out in turn, spread over the rig."""
-LEFT_OUT_TIMES = 2
-"""Number of frames that are held out in turn, if there are several."""
-MARGIN = 0.1
-"""How much larger than the hull the box is that may hold the subject, to each side."""
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,16 @@ from viewmend.studio.procedural.skeleton import INDEX, SIDES, SKIRT_COLUMNS, Phy
 
 Painter = Callable[[Canvas], Image]
 Azimuths = Float[np.ndarray, "column"]
+TOPS = ("t-shirt", "long sleeves", "shirt", "sweater", "tank top")
+"""Kinds of tops."""
+OUTERS = ("none", "jacket", "coat")
+"""Kinds of clothes over the top."""
+BOTTOMS = ("trousers", "jeans", "wide trousers", "leggings", "shorts", "skirt", "dress")
+"""Kinds of clothes below the waist."""
+LOOSE = ("plain", "heather", "denim", "tartan", "gingham", "knit", "pinstripes")
+"""Patterns of fabrics of jackets and coats."""
+LOWER = ("plain", "heather", "pinstripes", "tartan", "blobs", "knit", "zigzag", "gingham")
+"""Patterns of clothes below the waist."""
 
 
 @dataclass(frozen=True)
@@ -218,13 +228,6 @@ def skirt_sheets(
     weights = skirt_weights(body, points, theta)
     sheet = Patch(points, uv, weights, chart, closed=_closed(around))
     return two_sided(sheet, points - 0.005 * outward, 0.45)
-
-
-TOPS = ("t-shirt", "long sleeves", "shirt", "sweater", "tank top")
-OUTERS = ("none", "jacket", "coat")
-BOTTOMS = ("trousers", "jeans", "wide trousers", "leggings", "shorts", "skirt", "dress")
-LOOSE = ("plain", "heather", "denim", "tartan", "gingham", "knit", "pinstripes")
-LOWER = ("plain", "heather", "pinstripes", "tartan", "blobs", "knit", "zigzag", "gingham")
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ QUIET = ("plain", "heather", "denim", "knit", "stripes", "gradient", "bands")
 PRINTED = ("bands", "dots", "flowers", "blobs", "gradient", "zigzag", "letters")
 Image = Float[np.ndarray, "height width 3"]
 Plane = Float[np.ndarray, "height width"]
+ATLAS_GUTTER_PX = 3
+"""Pixels between two textures of the atlas, so that filters do not mix them."""
 
 
 @dataclass(frozen=True)
@@ -240,9 +242,6 @@ def write(
     ink = np.zeros(canvas.shape, dtype=np.uint8)
     cv2.putText(ink, word, (left, base), font, scale, 255, thick, cv2.LINE_AA)
     return blend(image, color, ink / 255.0)
-
-
-ATLAS_GUTTER_PX = 3
 
 
 @dataclass(frozen=True)

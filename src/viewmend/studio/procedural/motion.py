@@ -20,6 +20,23 @@ from viewmend.studio.procedural.skeleton import (
 )
 
 Tempo = Literal["calm", "dance", "fast"]
+SEAT = 0.262
+"""Height of the stool that fits a person, as a fraction of the person's height."""
+MOTIONS: dict[Tempo, tuple[str, ...]] = {
+    "calm": ("walk", "talk", "turn", "reach", "sit", "crouch", "sway"),
+    "dance": ("groove", "sidestep", "spin", "march", "lunge"),
+    "fast": ("run", "jacks", "box", "groove", "spin"),
+}
+"""Motions of each tempo."""
+BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
+"""Range of beats per second of each tempo."""
+OWN_BEAT_HZ = {"walk": (0.75, 0.98), "jacks": (0.85, 1.15), "run": (1.25, 1.5)}
+"""Range of beats per second of motions that have one of their own."""
+ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
+"""Factor on the size of movements, by tempo."""
+FASTEST_RAD_S = 7.0
+"""Fastest turn of an arm's joint, radians per second; hands then stay below about ten metres a
+second."""
 
 
 def ease(x: float) -> float:
@@ -186,10 +203,6 @@ def _crouching(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-SEAT = 0.262
-"""Height of the stool that fits a person, as a share of theirs."""
-
-
 def _sitting(score: Score, time_s: float, beats: float) -> Stance:
     """Sitting on a stool at the centre; some get up and sit down again."""
     H = score.height_m
@@ -263,17 +276,6 @@ GROUNDS = {
     "sit": _sitting,
     "reach": _reaching,
 }
-
-MOTIONS: dict[Tempo, tuple[str, ...]] = {
-    "calm": ("walk", "talk", "turn", "reach", "sit", "crouch", "sway"),
-    "dance": ("groove", "sidestep", "spin", "march", "lunge"),
-    "fast": ("run", "jacks", "box", "groove", "spin"),
-}
-BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
-OWN_BEAT_HZ = {"walk": (0.75, 0.98), "jacks": (0.85, 1.15), "run": (1.25, 1.5)}
-ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
-FASTEST_RAD_S = 7.0
-"""Fastest turn of an arm's joint; hands then stay below about ten metres a second."""
 
 
 @dataclass(frozen=True)

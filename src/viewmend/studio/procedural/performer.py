@@ -18,6 +18,8 @@ from viewmend.studio.procedural.skeleton import SIDES, Physique, Skeleton, build
 LAG_S = 0.12
 """Skirts and hair follow where the body was this long ago."""
 BUSY_HANDS = ("jacks", "box", "reach", "run")
+ROAMING = ("walk", "run", "sidestep")
+"""Motions that need the floor to themselves."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,6 @@ def draw_person(
         f"{sex}, {person.height_m:.2f} m, {hair.words}, {outfit.words}, {motion.score.kind} ({tempo}){held}"
     )
     return ProceduralPerson(assemble(patches), skeleton, motion, person, words)
-
-
-ROAMING = ("walk", "run", "sidestep")
-"""Motions that need the floor for themselves."""
 
 
 @dataclass(frozen=True)

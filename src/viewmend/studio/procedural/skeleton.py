@@ -49,6 +49,8 @@ INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINTS)}
 PARENTS: tuple[int, ...] = (-1, *(INDEX[name] for name in _PARENT.values()))
 SIGN = {"left": 1.0, "right": -1.0}
 """Sign of x on each side of the body."""
+SKIN_RGB = np.array(TABLES["skin"])
+"""Skin tones, sRGB in [0, 1]."""
 
 
 def rotation(axis: int, angle_rad: float) -> Rotation:
@@ -132,9 +134,6 @@ class Physique:
     """sRGB."""
     face: tuple[float, ...]
     """Eight numbers in [-1, 1]: the features' individual sizes and places."""
-
-
-SKIN_RGB = np.array(TABLES["skin"])
 
 
 def sample_physique(rng: np.random.Generator) -> Physique:
