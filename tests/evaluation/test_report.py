@@ -12,6 +12,7 @@ import pytest
 from viewmend.data.images import read_rgb
 from viewmend.evaluation.report import (
     blocks,
+    holes_line,
     main_grid,
     make_report,
     markdown,
@@ -115,14 +116,25 @@ def test_the_page_is_self_contained_and_has_all_images(evaluated):
 def test_every_scene_has_a_contact_sheet(evaluated, tmp_path):
     _, cells, store = evaluated
     assert sorted(path.name for path in write_sheets(cells, store, tmp_path)) == ["s1.png", "s3.png"]
-    # Rendered, E, two methods and the truth: whole, close up, and what is wrong, of which E and the truth have nothing.
+    # E, rendered, two methods and the truth: whole, close up, and what is wrong, of which E and the truth have nothing.
     sheet = read_rgb(tmp_path / "s1.png", "s1")
-    height, width = (sheet.shape[0] - GAP_PX) // 3, (sheet.shape[1] - GAP_PX) // 5
-    cells = sheet[GAP_PX:, GAP_PX:].reshape(3, height, 5, width, 3).swapaxes(1, 2)[:, :, LABEL_PX:]
-    assert [[bool((c[: -2 * GAP_PX, : -2 * GAP_PX] != BACKGROUND).any()) for c in row] for row in cells] == [
-        *([True] * 5, [True] * 5),
-        [True, False, True, True, False],
-    ]
+    height = (sheet.shape[0] - GAP_PX) // 5
+    width = (sheet.shape[1] - GAP_PX) // 3
+    tiles = sheet[GAP_PX:, GAP_PX:].reshape(5, height, 3, width, 3).swapaxes(1, 2)[:, :, LABEL_PX:]
+    shown = [[bool((c[: -2 * GAP_PX, : -2 * GAP_PX] != BACKGROUND).any()) for c in row] for row in tiles]
+    assert shown == [[True, True, False], *[[True] * 3] * 3, [True, True, False]]
+
+
+def test_the_page_shows_three_scores_and_explains_every_column(evaluated):
+    report, _, store = evaluated
+    shown = page(report, store)
+    head = shown.split("<thead>")[1].split("</thead>")[0]
+    heads = re.findall(r"<th([^>]*)>([^<]*)</th>", head)
+    first = [text for attributes, text in heads if "later" not in attributes]
+    assert first == ["method", "whole, dB", "holes, dB", "in mask"], "LPIPS was not measured"
+    unexplained = [text for attributes, text in heads[1:] if "title=" not in attributes]
+    assert not unexplained
+    assert shown.count("<details>") == len(report.tables)
 
 
 def test_the_close_up_contains_the_largest_hole():
@@ -131,3 +143,10 @@ def test_the_close_up_contains_the_largest_hole():
     top, left, side = largest_hole(error)
     assert top <= 40 and top + side >= 58 and left <= 80 and left + side >= 90 and side < 40
     assert largest_hole(np.zeros((60, 90, 3), np.uint8))[2] <= 60
+
+
+def test_a_run_without_holes_says_what_to_change(make_cell, make_frame):
+    for px, advised in ((20, True), (60, False)):
+        frame = make_frame(psnr_holes=20.0, hole_px=px)
+        table = make_report([make_cell("s", "telea", "A", [frame])], ("telea",), RunSettings()).tables[0]
+        assert ("--every" in holes_line(table)) == advised

@@ -3,8 +3,9 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, astuple, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from typing import Literal
 
 from viewmend.evaluation.averages import (
     Record,
@@ -64,29 +65,87 @@ RULES = (
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
 )
 """Definitions of the figures, printed with every report."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the main table with the mean of one score."""
+
+    head: str
+    metric: str
+    region: str
+    meaning: str
+    """What the score is, in one sentence."""
+    digits: int = 2
+    """Decimals that are printed."""
+    factor: int = 1
+    """The mean is multiplied by this."""
+    best: Literal["largest", "smallest"] | None = "largest"
+    """Which mean is the best, and printed bold."""
+
+
 COLUMNS = (
-    ("holes, dB", "psnr", "holes", 1, 2),
-    ("in mask", "psnr", "holes_fg", 1, 2),
-    ("other cameras", "psnr", "others", 1, 2),
-    ("only past", "psnr", "past", 1, 2),
-    ("masked", "psnr", "masked", 1, 2),
-    ("SSIM masked", "ssim", "masked", 1, 5),
-    ("whole, dB", "psnr", "whole", 1, 2),
-    ("rendered", "psnr_rendered", "whole", 1, 2),
-    ("SSIM whole", "ssim", "whole", 1, 4),
-    ("subject, dB", "psnr", "subject", 1, 2),
-    ("LPIPS whole", "lpips_alex", "whole", 1, 4),
-    ("LPIPS holes", "lpips_alex", "holes", 1, 4),
-    ("alpha IoU", "alpha_iou", "whole", 1, 4),
-    ("flicker", "flicker", "holes", 255, 2),
-    ("flicker whole", "flicker", "whole", 255, 2),
-    ("still", "change", "still", 255, 2),
+    Column("whole, dB", "psnr", "whole", "PSNR over all pixels of the completed view."),
+    Column(
+        "LPIPS whole",
+        "lpips_alex",
+        "whole",
+        "LPIPS (AlexNet) over all pixels; lower is better.",
+        4,
+        1,
+        "smallest",
+    ),
+    Column("holes, dB", "psnr", "holes", "PSNR over the pixels of the proxy that no source camera colours."),
+    Column("in mask", "psnr", "holes_fg", "PSNR over the holes inside the true mask."),
+    Column(
+        "other cameras", "psnr", "others", "PSNR over holes that only cameras other than the sources see now."
+    ),
+    Column("only past", "psnr", "past", "PSNR over holes that the source cameras saw in the past only."),
+    Column("masked", "psnr", "masked", "PSNR over all pixels of images that are black outside the holes."),
+    Column("SSIM masked", "ssim", "masked", "SSIM of images that are black outside the holes.", 5),
+    Column(
+        "rendered",
+        "psnr_rendered",
+        "whole",
+        "PSNR over all pixels of the rendered view, before it is completed.",
+    ),
+    Column("SSIM whole", "ssim", "whole", "SSIM over all pixels of the completed view.", 4),
+    Column("subject, dB", "psnr", "subject", "PSNR inside the true mask."),
+    Column(
+        "LPIPS holes",
+        "lpips_alex",
+        "holes",
+        "LPIPS (AlexNet) in the holes; lower is better.",
+        4,
+        1,
+        "smallest",
+    ),
+    Column("alpha IoU", "alpha_iou", "whole", "Overlap of the true mask with alpha above one half.", 4),
+    Column(
+        "flicker",
+        "flicker",
+        "holes",
+        "Change of the error in the holes since the frame before.",
+        2,
+        255,
+        "smallest",
+    ),
+    Column(
+        "flicker whole", "flicker", "whole", "Change of the error since the frame before.", 2, 255, "smallest"
+    ),
+    Column(
+        "still",
+        "change",
+        "still",
+        "Change since the frame before where the truth does not move.",
+        2,
+        255,
+        None,
+    ),
 )
-"""Columns of the main table: heading, metric, region, factor, decimals."""
-HIGHER = ("psnr", "ssim", "alpha_iou")
-"""The largest mean of these metrics is the best."""
-LOWER = ("flicker", "lpips_alex")
-"""The smallest mean of these metrics is the best."""
+"""The scores of the main table."""
+FIRST_COLUMNS = 3
+"""A page shows this many scores, the first of `COLUMNS`, before it is asked for all of them."""
 SPREAD = (
     ("psnr", "holes"),
     ("psnr", "holes_fg"),
@@ -96,6 +155,15 @@ SPREAD = (
     ("psnr", "subject"),
 )
 """Columns that also show the standard error over scenes."""
+REST_MEANINGS = {
+    f"over {REFERENCE}": f"Mean gain over {REFERENCE} in the holes, dB, over the scenes where both have a score.",
+    "VFID": "Frechet distance of videos (I3D) over all pixels; lower is better.",
+    "ms": "Median milliseconds of the method's step, without hull and rendering.",
+    "ms p95": "95th percentile of the milliseconds.",
+    "scenes": "Scenes with a score in the holes.",
+    "failed": "Scenes in which the method failed.",
+}
+"""What the columns after the scores hold."""
 EMPTY = ("", "-", "n/a", "0")
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
 """Readings of each score: heading, region."""
@@ -159,10 +227,16 @@ class Grid:
 
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    meanings: Mapping[str, str] = field(default_factory=dict)
+    """What the columns of some heads hold."""
+    first: int | None = None
+    """A page shows this many columns before it is asked for all of them; None for all."""
+    folded: str = ""
+    """A page shows only this title before it is asked for the table; with "", it shows the table."""
 
 
 def setting_lines(report: Report) -> list[str]:
-    """The settings and the origin of the figures."""
+    """The settings of the evaluation."""
     settings = report.settings
     render = report.settings.stream.render
     lines = [
@@ -170,7 +244,12 @@ def setting_lines(report: Report) -> list[str]:
         f"{settings.precision}; {render.cameras} source cameras by {render.selection}; error rule "
         f"{render.error_rule or 'of each method'}; SSIM {settings.ssim}; scored on {settings.background}."
     ]
-    return [*lines, *background_lines(report)] + [
+    return [*lines, *background_lines(report)]
+
+
+def origin_lines(report: Report) -> list[str]:
+    """Where the figures were computed, and by which versions."""
+    return [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "
         f"{o.jobs} process{'es' if o.jobs > 1 else ''} of {o.threads} threads, load {o.load}."
         for o in report.origins
@@ -199,10 +278,15 @@ def holes_line(table: Table) -> str:
         else ""
     )
     composition = _composition_line(table)
+    advice = ""
+    if table.frames and table.thin_frames == table.frames:
+        advice = (
+            f" No frame has {MIN_HOLE_PX} of them: take more scenes (--every 3), or larger views (--size)."
+        )
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
         f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames have too few hole pixels to be "
-        f"scored there ({table.empty_frames} of them have none).{composition}"
+        f"scored there ({table.empty_frames} of them have none).{composition}{advice}"
     )
 
 
@@ -230,45 +314,37 @@ def main_grid(table: Table) -> Grid:
 
     The best of several values is bold, and mean scores have their standard error over the scenes.
     """
-    heads = (
-        "method",
-        f"over {REFERENCE}",
-        *(c[0] for c in COLUMNS),
-        "VFID",
-        "ms",
-        "ms p95",
-        "scenes",
-        "failed",
-    )
-    best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
-    return _without_empty_columns(
-        Grid(heads, tuple(_method_row(row, len(heads), best) for row in table.rows))
-    )
+    heads = tuple(column.head for column in COLUMNS)
+    rest = (f"over {REFERENCE}", "VFID", "ms", "ms p95", "scenes", "failed")
+    best = [_best(table.rows, column) for column in COLUMNS]
+    rows = tuple(_method_row(row, best, len(rest)) for row in table.rows)
+    meanings = {column.head: column.meaning for column in COLUMNS} | REST_MEANINGS
+    return _without_empty_columns(Grid(("method", *heads, *rest), rows, meanings, 1 + FIRST_COLUMNS))
 
 
 def _without_empty_columns(grid: Grid) -> Grid:
     used = [n for n in range(len(grid.heads)) if n == 0 or any(row[n] not in EMPTY for row in grid.rows)]
-    return Grid(tuple(grid.heads[n] for n in used), tuple(tuple(row[n] for n in used) for row in grid.rows))
+    heads = tuple(grid.heads[n] for n in used)
+    return replace(grid, heads=heads, rows=tuple(tuple(row[n] for n in used) for row in grid.rows))
 
 
-def _best(rows: Sequence[Row], column: int) -> float | None:
+def _best(rows: Sequence[Row], column: Column) -> float | None:
     """The best mean of a column, as shown; None if it has no best, or all are equal."""
-    _, metric, region, factor, digits = COLUMNS[column]
-    means = (row.scores.mean(metric, region) for row in rows if row.method not in PRIVILEGED)
-    values = {round(factor * value, digits) for value in means if value is not None}
-    if len(values) < 2 or metric not in (*HIGHER, *LOWER):
+    means = (row.scores.mean(column.metric, column.region) for row in rows if row.method not in PRIVILEGED)
+    values = {round(column.factor * value, column.digits) for value in means if value is not None}
+    if len(values) < 2 or column.best is None:
         return None
-    return max(values) if metric in HIGHER else min(values)
+    return max(values) if column.best == "largest" else min(values)
 
 
-def _score_cell(row: Row, column: int, best: float | None) -> str:
-    _, metric, region, factor, digits = COLUMNS[column]
-    mean = row.scores.mean(metric, region)
-    error = row.scores.standard_error(metric, region) if (metric, region) in SPREAD else None
-    text = number(mean, factor, digits)
+def _score_cell(row: Row, column: Column, best: float | None) -> str:
+    mean = row.scores.mean(column.metric, column.region)
+    with_error = (column.metric, column.region) in SPREAD
+    error = row.scores.standard_error(column.metric, column.region) if with_error else None
+    text = number(mean, column.factor, column.digits)
     if error is not None:
-        text += f" ± {factor * error:.{digits}f}"
-    is_best = best is not None and mean is not None and round(factor * mean, digits) == best
+        text += f" ± {column.factor * error:.{column.digits}f}"
+    is_best = best is not None and mean is not None and round(column.factor * mean, column.digits) == best
     return f"**{text}**" if is_best and row.method not in PRIVILEGED else text
 
 
@@ -283,7 +359,7 @@ def readings_grid(table: Table) -> Grid:
             for _, region in READINGS
         ]
         rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in row.vfid.values())))
-    return _without_empty_columns(Grid(heads, tuple(rows)))
+    return _without_empty_columns(Grid(heads, tuple(rows), folded="All scores in all readings"))
 
 
 def scenes_grid(report: Report) -> Grid:
@@ -323,20 +399,31 @@ Block = str | list[str] | Grid
 
 
 def blocks(report: Report) -> list[Block]:
-    """The whole report, for Markdown and HTML."""
+    """The whole report, for Markdown."""
+    return [*figures(report), *notes(report)]
+
+
+def figures(report: Report) -> list[Block]:
+    """The first part of a report: its settings and the scores of all sets."""
     parts: list[Block] = ["# Evaluation", setting_lines(report)]
     for table in report.tables:
         parts += [*_main(table), readings_grid(table)]
-    if missing := not_available(report):
-        parts += ["## Not available", missing]
-    parts += ["## Scenes", "PSNR in the holes, dB.", scenes_grid(report)]
+    return parts
+
+
+def notes(report: Report) -> list[Block]:
+    """The second part: scores by scene, what failed or is missing, and how everything was computed."""
+    parts: list[Block] = ["## Scenes", "PSNR in the holes, dB.", scenes_grid(report)]
     failed = [
         printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in report.cells if c.error is not None
     ]
     if failed:
         parts += ["## Failed", failed]
+    if missing := not_available(report):
+        parts += ["## Not available", missing]
     parts += ["## What the figures mean", list(RULES)]
-    return [*parts, "## Methods", [f"{name}: {report.identities.get(name, '?')}" for name in report.methods]]
+    parts += ["## Methods", [f"{name}: {report.identities.get(name, '?')}" for name in report.methods]]
+    return [*parts, "## Origin", origin_lines(report)]
 
 
 def markdown(parts: Iterable[Block]) -> str:
@@ -418,14 +505,14 @@ def bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"* {line}" for line in lines)
 
 
-def _method_row(row: Row, width: int, best: dict[int, float | None]) -> tuple[str, ...]:
+def _method_row(row: Row, best: Sequence[float | None], others: int) -> tuple[str, ...]:
+    """A method's cells; `others` are the columns after the scores."""
     if not row.scenes:
-        return (row.method, *["n/a"] * (width - 1))
-    name = f"{row.method} (given the true past)" if row.method in PRIVILEGED else row.method
+        return (row.method, *["n/a"] * (len(COLUMNS) + others))
     return (
-        name,
+        f"{row.method} (given the true past)" if row.method in PRIVILEGED else row.method,
+        *(_score_cell(row, column, mean) for column, mean in zip(COLUMNS, best, strict=True)),
         "-" if row.over_reference is None else f"{row.over_reference:+.2f}",
-        *(_score_cell(row, column, best[column]) for column in range(len(COLUMNS))),
         number(row.vfid["whole_eval"], 1, 4, "n/a"),
         *(number(getattr(row.speed, name, None), 1, 1) for name in ("ms_p50", "ms_p95")),
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",

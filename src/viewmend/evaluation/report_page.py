@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from viewmend.data.images import write_image
-from viewmend.evaluation.report import Block, Grid, Report, blocks
+from viewmend.evaluation.report import Block, Grid, Report, figures, notes
 from viewmend.evaluation.result_cache import Cell, CellStore, SceneImages, slug
 from viewmend.utils.contact_sheet import Picture, Tile, contact_sheet
 
@@ -20,8 +20,8 @@ TILE_PX = 288
 CLOSE_UP_SHARE = 6
 """A close-up is 1/6 of the view's shorter side, or as large as the hole."""
 LEGEND = (
-    "Each scene at its frame with the most hole pixels: the whole view; a close-up of the largest hole; its difference "
-    f"from the truth, {DIFFERENCE_GAIN} times brighter. All scenes are in sheets/."
+    "Each scene at its frame with the most hole pixels, a row for each method: the whole view, a close-up of the "
+    f"largest hole, and its difference from the true view, {DIFFERENCE_GAIN} times brighter. All scenes are in sheets/."
 )
 
 
@@ -29,13 +29,14 @@ def page(report: Report, store: CellStore, shown: int = 12) -> str:
     """The whole page, with images of the first `shown` scenes of each set."""
     import cv2
 
-    parts = [*map(_html, blocks(report)), f"<h2>Images</h2><p>{LEGEND}</p>"]
+    parts = [*map(_html, figures(report)), f"<h2>Images</h2><p>{LEGEND}</p>"]
     for scene in _first_scenes(report.cells, shown):
         sheet = scene_sheet([cell for cell in report.cells if cell.key.scene == scene], store)
         if sheet is not None:
             data = base64.b64encode(cv2.imencode(".jpg", sheet[..., ::-1])[1].tobytes()).decode()
             image = f'<img alt="{escape(scene)}" src="data:image/jpeg;base64,{data}">'
             parts.append(f'<h3>{escape(scene)}</h3><div class="wide">{image}</div>')
+    parts += map(_html, notes(report))
     style = (files("viewmend.evaluation") / "report.css").read_text(encoding="utf-8")
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -63,16 +64,14 @@ def scene_sheet(cells: Sequence[Cell], store: CellStore) -> Picture | None:
         return None
     top, left, side = largest_hole(images.error)
     close = (slice(top, top + side), slice(left, left + side))
-    columns = _columns(cells, images, store)
-    rows = [[Tile(label, image) for label, image in columns], [], []]
-    for label, image in columns:
+    rows = []
+    for label, image in _labelled_images(cells, images, store):
         near = None if image is None else np.ascontiguousarray(image[close])
         difference = None
-        if near is not None and label not in ("E", "truth"):
+        if near is not None and label not in ("E", "true"):
             off = np.abs(near.astype(np.int16) - images.truth[close])
             difference = (off * DIFFERENCE_GAIN).clip(0, 255).astype(np.uint8)
-        rows[1].append(Tile("", near))
-        rows[2].append(Tile("", difference))
+        rows.append([Tile(label, image), Tile("close-up", near), Tile("difference", difference)])
     return contact_sheet(rows, TILE_PX)
 
 
@@ -106,24 +105,23 @@ def _first_scenes(cells: Sequence[Cell], count: int) -> list[str]:
     return [scene for scenes in of.values() for scene in list(scenes)[:count]]
 
 
-def _columns(
+def _labelled_images(
     cells: Sequence[Cell], shared: SceneImages, store: CellStore
 ) -> list[tuple[str, Picture | None]]:
-    """A scene's images with labels: rendered, E, each method, truth; None for a method that failed."""
-    shown: list[tuple[str, Picture | None]] = [("rendered", shared.rendered), ("E", shared.error)]
+    """A scene's images with labels: E, rendered, each method, true; None for a method that failed."""
+    shown: list[tuple[str, Picture | None]] = [("E", shared.error), ("rendered", shared.rendered)]
     for cell in cells:
         if cell.error is not None:
             shown.append((f"{cell.key.method}: failed", None))
             continue
         score = max(cell.frames, key=lambda frame: frame.hole_px).psnr_holes
         shown.append((cell.key.method + ("" if score is None else f" {score:.2f} dB"), store.image(cell.key)))
-    return [*shown, ("truth", shared.truth)]
+    return [*shown, ("true", shared.truth)]
 
 
 def _html(block: Block) -> str:
     if isinstance(block, Grid):
-        head, *rows = (_row(line, "td" if n else "th") for n, line in enumerate((block.heads, *block.rows)))
-        return f'<div class="wide"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+        return _table(block)
     if isinstance(block, list):
         return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in block)}</ul>"
     level = len(block) - len(block.lstrip("#"))
@@ -131,9 +129,26 @@ def _html(block: Block) -> str:
     return f"<{kind}>{escape(block.lstrip('# '))}</{kind}>"
 
 
-def _row(line: Sequence[str], kind: str) -> str:
-    texts = (escape(cell.strip("*")) for cell in line)
-    marked = (
-        f"<strong>{text}</strong>" if "**" in cell else text for cell, text in zip(line, texts, strict=True)
+def _table(grid: Grid) -> str:
+    """A table whose later columns appear when a box is ticked, and which may be folded away."""
+    hidden = grid.first is not None and grid.first < len(grid.heads)
+    first = grid.first if hidden else None
+    head = "".join(
+        _cell(text, "th", n, first, grid.meanings.get(text, "")) for n, text in enumerate(grid.heads)
     )
-    return f"<tr>{''.join(f'<{kind}>{text}</{kind}>' for text in marked)}</tr>"
+    rows = ("".join(_cell(text, "td", n, first) for n, text in enumerate(row)) for row in grid.rows)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    if hidden:
+        table = f'<div class="columns"><label><input type="checkbox"> all columns</label>{table}</div>'
+    return f"<details><summary>{escape(grid.folded)}</summary>{table}</details>" if grid.folded else table
+
+
+def _cell(text: str, kind: str, column: int, first: int | None, meaning: str = "") -> str:
+    """A cell; from column `first` on, it is hidden until all columns are asked for."""
+    later = ' class="later"' if first is not None and column >= first else ""
+    hover = f' title="{escape(meaning)}"' if meaning else ""
+    shown = escape(text.strip("*"))
+    if "**" in text:
+        shown = f"<strong>{shown}</strong>"
+    return f"<{kind}{later}{hover}>{shown}</{kind}>"
