@@ -6,6 +6,7 @@ weights. A garment is a bigger body.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -127,7 +128,7 @@ class Limb:
         """Metres from the first joint to the last."""
         return float(np.linalg.norm(self.end - self.start))
 
-    @property
+    @cached_property
     def frame(self) -> Rotation:
         """Rows: sideways, up the limb, and forward."""
         up = unit(self.start - self.end)
