@@ -12,7 +12,7 @@ CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/te
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 
-.PHONY: demo test test-all tests shapes kernels gate pyright docs format clean
+.PHONY: demo test test-all tests slow shapes kernels gate pyright docs format clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
@@ -24,6 +24,9 @@ test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays
 
 tests: kernels
 	JAXTYPING_DISABLE=1 $(PYTEST)
+
+slow: kernels ## tests over ten seconds, and those in a browser
+	JAXTYPING_DISABLE=1 $(PYTEST) -m slow
 
 shapes: kernels
 	$(BIN)/pytest $(CHECKED)

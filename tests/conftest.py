@@ -53,6 +53,12 @@ def no_weights(tmp_path, monkeypatch) -> None:
         monkeypatch.setenv(name, str(tmp_path / "nowhere"))
 
 
+@pytest.fixture
+def with_ray() -> None:
+    """Skips a test without Ray. `import ray` would not tell: it may find the folder tests/contrib/ray."""
+    pytest.importorskip("ray.exceptions", reason="needs the extra: pip install 'viewmend[ray]'")
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The developers' folder of real captures and performers; tests that need it are skipped where it is absent."""

@@ -219,8 +219,8 @@ def test_an_edited_error_rule_makes_other_cells(small_scenes, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("with_ray")
 def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
-    pytest.importorskip("ray", reason="Ray is not installed")
     # In a separate process: Ray leaves sockets and threads behind, which the test session reports as errors.
     subprocess.run(script(small_scenes, tmp_path, "local"), check=True, capture_output=True)
     assert len(list((tmp_path / "cells").glob("*.json"))) == len(METHODS) * len(small_scenes)

@@ -160,7 +160,6 @@ async def test_the_start_is_reported_when_the_first_view_is_rendered():
 @contextlib.contextmanager
 def started(*options):
     """The command, once it has printed its address."""
-    pytest.importorskip("ray", reason="Ray is not installed")
     command = [sys.executable, "-m", "viewmend", "serve", "--ray", "local", *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         assert server.stderr is not None
@@ -175,6 +174,7 @@ def started(*options):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("with_ray")
 def test_a_viewer_reconnects_when_its_replica_is_killed():
     with started(*SMALL) as (_, address):
         assert get(f"{address}/frame.jpg")[0] == 401
@@ -194,8 +194,8 @@ def test_a_viewer_reconnects_when_its_replica_is_killed():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("with_ray")
 def test_an_unusable_source_is_the_same_error_as_without_ray(tmp_path):
-    pytest.importorskip("ray", reason="Ray is not installed")
     (tmp_path / "empty").mkdir()
     command = [
         sys.executable,
