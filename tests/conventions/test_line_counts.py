@@ -7,8 +7,8 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 122,
-    "walruses": 82,
+    "parallel": 0,
+    "walruses": 26,
     "prepositions": 2,
     "late_constants": 22,
     "statements": 3,

@@ -120,6 +120,7 @@ def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str
         "\n".join(setting_lines(report)),
         grid,
     ]
-    if missing := not_available(report):
+    missing = not_available(report)
+    if missing:
         lines.append("n/a:\n\n" + bullets(missing))
     return "\n\n".join(lines) + "\n"

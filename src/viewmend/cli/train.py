@@ -96,7 +96,8 @@ def run(options: Options) -> int:
             train(options.config, options.out, report=report, stopped=lambda: stopped() > 0)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
-    if number := stopped():
+    number = stopped()
+    if number:
         say(
             f"{options.out}: stopped after step {steps[0].step if steps else 0}; run the same command to resume"
         )

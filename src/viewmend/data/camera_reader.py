@@ -91,7 +91,8 @@ class CameraReader:
         depth = None
         if camera.mask:
             path, where = self.locate("mask", time)
-            if (mask := self._read_mask(path, where, time)) is None:
+            mask = self._read_mask(path, where, time)
+            if mask is None:
                 return None
             mask = self._as_stored(mask, path)
             self._check_mask_size(mask, where)
@@ -112,7 +113,8 @@ class CameraReader:
 
     def _read_mask(self, path: Path, where: str, time: int) -> UInt8[np.ndarray, "height width"] | None:
         if self._mask_video:
-            if (image := self._mask_video.read(int(self._index["masks"][time]), where)) is None:
+            image = self._mask_video.read(int(self._index["masks"][time]), where)
+            if image is None:
                 return None
             mask = to_mask(image)
         elif self.camera.mask == self.camera.image:

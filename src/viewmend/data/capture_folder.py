@@ -339,7 +339,8 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     for camera in cameras:
         offset_s = camera.offset_ms / 1000
         for kind in ("images", "masks"):
-            if (path := films.get((camera.name, kind))) is not None:
+            path = films.get((camera.name, kind))
+            if path is not None:
                 tracks.append(video_track(camera.name, kind, path, offset_s))
             elif kind == "images":  # numbered masks follow their images
                 tracks.append(Track(camera.name, kind, numbers_s, fps, offset_s))

@@ -9,10 +9,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-PQ, HLG, LINEAR = 16, 18, 8
-"""Transfer functions: SMPTE ST 2084, ARIB STD-B67, and none."""
-BT2020, DCI_P3, DISPLAY_P3 = 9, 11, 12
-"""Primaries other than sRGB's."""
+PQ = 16
+"""Code of the transfer function of SMPTE ST 2084 (codes of ITU-T H.273, as all that follow)."""
+HLG = 18
+"""Code of the transfer function of ARIB STD-B67."""
+LINEAR = 8
+"""Code of linear light."""
+BT2020 = 9
+"""Code of the primaries of ITU-R BT.2020."""
+DCI_P3 = 11
+"""Code of the primaries of SMPTE RP 431-2."""
+DISPLAY_P3 = 12
+"""Code of the primaries of SMPTE EG 432-1."""
 PQ_WHITE_NITS = 203.0
 """Luminance of standard white in PQ, cd/m2 (ITU-R BT.2408)."""
 PQ_PEAK_NITS = 10000.0
@@ -26,8 +34,7 @@ TO_BT709 = {
     DCI_P3: ((1.2249, -0.2247, 0.0), (-0.0420, 1.0419, 0.0), (-0.0197, -0.0786, 1.0979)),
     DISPLAY_P3: ((1.2249, -0.2247, 0.0), (-0.0420, 1.0419, 0.0), (-0.0197, -0.0786, 1.0979)),
 }
-"""Linear RGB of BT.709, which are those of sRGB, from linear RGB of other primaries with the same
-white (D65)."""
+"""Matrices that convert linear RGB of other primaries to that of BT.709 and sRGB, all with white D65."""
 
 
 def is_srgb(primaries: int, transfer: int) -> bool:

@@ -259,11 +259,13 @@ def _read_file(path: Path, where: str) -> bytes:
 
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
-    if (size := size_from_header(data)) is not None and size[0] * size[1] > MAX_PIXELS:
+    size = size_from_header(data)
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
         most = f"{MAX_PIXELS / 1e6:.0f} million pixels"
         got = f"{size[0]} x {size[1]}"
         raise CaptureError(f"{where}: expected an image of at most {most}, got {got}; reduce its size")
-    if (image := decode_image(data, flags)) is None:
+    image = decode_image(data, flags)
+    if image is None:
         got = f"{len(data)} bytes that are not an image or are truncated"
         raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
     return image

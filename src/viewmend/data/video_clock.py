@@ -14,9 +14,10 @@ from viewmend.data.videos import video_properties
 
 ABSENT = -1
 """Stands for the frame of a film that has none at a time."""
-TOLERANCE, NEW_TIME = 0.5, 0.75
-"""In frame periods: a frame belongs to a time if it is at most the first from it, and adds a time
-of its own if it is farther than the second from all others."""
+TOLERANCE = 0.5
+"""A frame belongs to a time that is at most this many frame periods from it."""
+NEW_TIME = 0.75
+"""A frame adds a time of its own if it is more than this many frame periods from all others."""
 GAP = 1.5
 """Frames are missing where the interval is this many periods."""
 SAME_PHASE = 0.5

@@ -100,7 +100,8 @@ def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
 def _check(names: list[str], jobs: int) -> None:
     if jobs < 1:
         raise ValueError(f"expected at least one job, got {jobs}")
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
         raise ValueError(
             f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder"
         )

@@ -194,7 +194,8 @@ class _MethodStream:
 
     def _make(self, bounds: Bounds | None) -> ViewSequence:
         settings = self._settings
-        if new := self.method not in self._loaded:
+        new = self.method not in self._loaded
+        if new:
             self._loaded[self.method] = make_method(self.method, settings.device, settings.precision)
         inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
@@ -236,7 +237,8 @@ def _check(completed: CompletedView) -> None:
         raise ValueError(
             f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view"
         )
-    if changed := int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum()):
+    changed = int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum())
+    if changed:
         raise ValueError(
             f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E"
         )

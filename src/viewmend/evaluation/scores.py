@@ -288,7 +288,8 @@ def _temporal(
     shown = (view.mask > 0) | truth.mask
     still = shown & ((true_now - true_then).abs().amax(0) < STILL)
     found = {"change_still": change(now, then, still, MIN_HOLE_PX)}
-    if (flow := truth.backward_flow_px) is not None:
+    flow = truth.backward_flow_px
+    if flow is not None:
         found["flicker_whole"] = warp_error(now - true_now, then - true_then, flow, shown)
         found["flicker"] = warp_error(now - true_now, then - true_then, flow, view.holes, MIN_HOLE_PX)
     return found

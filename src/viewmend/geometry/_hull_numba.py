@@ -4,8 +4,16 @@ import numpy as np
 
 from viewmend.utils.compiled import kernel
 
-UNSEEN, EMPTY, FULL, MIXED = 0, 1, 2, 3
+UNSEEN = 0
+"""A camera does not see the block."""
+EMPTY = 1
+"""The block is outside of a camera's mask."""
+FULL = 2
+"""The block is inside a camera's mask."""
+MIXED = 3
+"""The edge of a camera's mask crosses the block."""
 NEAR_M = 1e-6
+"""Points with a smaller z-depth than this, in metres, are behind a camera."""
 
 
 @kernel
@@ -153,7 +161,8 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
                 verdict = judge(P[view], lens[view], x, y, z, radius, size[view], pool, tile, sums[view])
                 if verdict == EMPTY:
                     # It will call the next block empty as well: ask it first.
-                    order[n], order[0] = order[0], view
+                    order[n] = order[0]
+                    order[0] = view
                     seen = -1
                     break
                 if verdict == FULL:
@@ -191,8 +200,12 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             for k in range(values.shape[2]):
-                x[left], y[left], z[left] = i, j, k
-                smallest[left], seen[left], place[left] = 255, seen_before, left
+                x[left] = i
+                y[left] = j
+                z[left] = k
+                smallest[left] = 255
+                seen[left] = seen_before
+                place[left] = left
                 left += 1
     origin = (low[0] + 0.5 * voxel_m, low[1] + 0.5 * voxel_m, low[2] + 0.5 * voxel_m)
     for n in range(len(views)):
@@ -201,7 +214,8 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
         kept = sample(soft[view], left, scratch)
         if kept < left // 2:
             # A camera that empties much of this block will empty much of the next: ask it first.
-            views[n], views[0] = views[0], view
+            views[n] = views[0]
+            views[0] = view
         left = kept
         if left == 0:
             break
@@ -292,7 +306,11 @@ def sample(image, count, scratch):
             under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
             value = min(value, over * (one - b) + under * b)
         if value > 0:
-            x[kept], y[kept], z[kept] = x[n], y[n], z[n]
-            smallest[kept], seen[kept], place[kept] = value, seen[n], place[n]
+            x[kept] = x[n]
+            y[kept] = y[n]
+            z[kept] = z[n]
+            smallest[kept] = value
+            seen[kept] = seen[n]
+            place[kept] = place[n]
             kept += 1
     return kept

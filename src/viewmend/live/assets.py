@@ -39,6 +39,7 @@ from viewmend.rendering.view import RenderConfig
 from viewmend.types import ContextViews, MultiViewFrame
 
 JPEG_QUALITY = 80
+"""JPEG quality of the cameras' images."""
 MARGIN_PX = 1
 """Pixels around the subject's part of an image: a bilinear sample outside touches no foreground."""
 KEPT_PX = 8
@@ -49,13 +50,18 @@ MASK_STEP = 17
 COLOUR_STRIDE = 4
 """Vertices are coloured from images reduced by this factor: neighbouring vertices are several
 pixels apart."""
-READ_S, POLL_S = 10.0, 0.02
-"""Time limit for reading a frame, and time between attempts."""
+READ_S = 10.0
+"""Time limit for reading a frame, seconds."""
+POLL_S = 0.02
+"""Seconds between attempts to read a frame."""
 NOT_IN_TIME = "the frame was not available in time; see /health"
+"""The error of a request whose frame was not read in time."""
 MAX_MAKING = 16
-"""Frames whose assets are being made at a time."""
+"""Largest number of frames whose assets are made at the same time."""
 MEMORY_MB = 64.0
+"""Memory for assets that are kept, in MB."""
 COMPRESSION = 6
+"""zlib's compression level of meshes and masks."""
 Names = tuple[str, ...]
 Key = tuple[int, Names]
 """A frame, and the cameras that are left out."""
@@ -115,7 +121,9 @@ class AssetStore:
         memory_mb: float = MEMORY_MB,
     ) -> None:
         """Set up; `read` returns None while a frame is not in memory, and `make` is called on a thread."""
-        self._read, self._make, self._max_bytes = read, make, 1e6 * memory_mb
+        self._read = read
+        self._make = make
+        self._max_bytes = 1e6 * memory_mb
         self._kept: OrderedDict[Key, FrameAssets] = OrderedDict()
         self._making: dict[Key, asyncio.Task[FrameAssets]] = {}
         self._turn = asyncio.Lock()
@@ -136,12 +144,15 @@ class AssetStore:
         if version != self._version:
             self._kept.clear()
             self._making.clear()  # those of the rig before end without being kept
-            self._version, self.size_bytes = version, 0
+            self._version = version
+            self.size_bytes = 0
         key = index, without
-        if (kept := self._kept.get(key)) is not None:
+        kept = self._kept.get(key)
+        if kept is not None:
             self._kept.move_to_end(key)
             return kept
-        if (task := self._making.get(key)) is None:
+        task = self._making.get(key)
+        if task is None:
             if len(self._making) >= MAX_MAKING:
                 raise BusyError("too many frames are being prepared; try again")
             task = self._making[key] = asyncio.create_task(self._prepare(key, version))
@@ -180,7 +191,9 @@ async def wait_for_frame(
 
 def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig) -> FrameAssets:
     """The assets of a frame with masks."""
-    cameras, images, lengths = [], [], []
+    cameras = []
+    images = []
+    lengths = []
     for n, (rgb, mask) in enumerate(zip(frame.per_camera("rgb"), frame.per_camera("mask"), strict=True)):
         top, bottom, left, right = _subject_box(mask.cpu().numpy())
         part = rgb[:, top:bottom, left:right].movedim(0, -1).contiguous().cpu().numpy()
@@ -189,7 +202,8 @@ def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfi
         images.append(Asset(jpeg + packed_mask, "image/jpeg"))
         lengths.append(len(jpeg))
     arrays = _shape_arrays(frame, proxy)
-    vertices, blend = proxy.mesh.vertices, config.blend
+    vertices = proxy.mesh.vertices
+    blend = config.blend
     packed = {name: pack_differences(values) for name, (values, _) in arrays.items()}
     described = cameras_json(concatenate_cameras(cameras))
     header: dict[str, Any] = {
@@ -231,7 +245,8 @@ def _shape_arrays(
 def _colours(frame: MultiViewFrame, proxy: GeometryProxy) -> Float[np.ndarray, "vertex 3"]:
     """RGB of the vertices in [0, 1], for what the closest cameras do not see."""
     assert frame.mask is not None, "a frame with a hull has masks"
-    stride, rig = COLOUR_STRIDE, frame.cameras
+    stride = COLOUR_STRIDE
+    rig = frame.cameras
     if min(frame.mask.shape[1:]) < 64 * stride:
         stride = 1
     first = stride // 2

@@ -117,8 +117,11 @@ class RateLimit:
     """A token bucket: `per_s` events a second on average, `burst` at once."""
 
     def __init__(self, per_s: float | int, burst: float | int, now: Callable[[], float]) -> None:
-        self._per_s, self._burst, self._now = per_s, burst, now
-        self._left, self._updated_s = burst, now()
+        self._per_s = per_s
+        self._burst = burst
+        self._now = now
+        self._left = burst
+        self._updated_s = now()
 
     def allow(self) -> bool:
         """Count one event; False if it is above the limit."""

@@ -22,17 +22,25 @@ from viewmend.live.protocol import FrameTimes
 from viewmend.models.base import Inpainter
 
 MEMORY_FRAMES = 5
+"""Number of the last frames whose median times predict the next."""
 HEADROOM = 0.85
+"""Fraction of the target that a level may be predicted to take to be chosen."""
 UP_AFTER_FRAMES = 4
+"""Number of frames with room for the next level, after which the level goes up at first."""
 MAX_UP_AFTER_FRAMES = 256
+"""Largest number of frames with room that a step up can need."""
 PROBATION_FRAMES = 12
+"""A step up that is undone within this many frames was wrong."""
 COARSE_FILL_COST = 0.15
 """Cost of a fill without context, relative to the full level."""
-REFINE_FIXED, REFINE_COST = 0.1, 0.3
-"""Cost that does not depend on resolution, and cost of inpainting an arbitrarily small part,
-relative to all of it."""
-FADE_FIXED, FADE_COST = 0.05, 0.13
-"""The same costs if nothing is inpainted and background is only faded."""
+REFINE_FIXED = 0.1
+"""Cost of refining that does not depend on resolution, relative to the full level."""
+REFINE_COST = 0.3
+"""Cost of refining an arbitrarily small part at full resolution, relative to the full level."""
+FADE_FIXED = 0.05
+"""Cost of fading background that does not depend on resolution, relative to the full level."""
+FADE_COST = 0.13
+"""Cost of fading background at full resolution, relative to the full level."""
 MAX_WAIT_S = 2.5
 """All viewers that wait for an image are predicted to be served within this time, one after the other."""
 IDLE_WAIT_S = 1.0
@@ -133,7 +141,9 @@ class Budget:
         self._geometry, self._pixels, self._inpainting, self._context = (
             deque[float](maxlen=MEMORY_FRAMES) for _ in range(4)
         )
-        self._up_after, self._frames_with_room, self._frames_since_up = UP_AFTER_FRAMES, 0, PROBATION_FRAMES
+        self._up_after = UP_AFTER_FRAMES
+        self._frames_with_room = 0
+        self._frames_since_up = PROBATION_FRAMES
 
     @property
     def level(self) -> QualityLevel:
@@ -168,16 +178,16 @@ class Budget:
             good = [
                 n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms
             ]
-            self.index, self._frames_with_room, self._frames_since_up = (
-                max(good, default=0),
-                0,
-                PROBATION_FRAMES,
-            )
+            self.index = max(good, default=0)
+            self._frames_with_room = 0
+            self._frames_since_up = PROBATION_FRAMES
         elif self.index + 1 < len(self.levels):
             fits = self.predict_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
             self._frames_with_room = self._frames_with_room + 1 if fits else 0
             if self._frames_with_room >= self._up_after:
-                self.index, self._frames_with_room, self._frames_since_up = self.index + 1, 0, 0
+                self.index += 1
+                self._frames_with_room = 0
+                self._frames_since_up = 0
 
     def as_json(self) -> dict[str, float | int | None]:
         """The part `budget` of the message `stats`."""

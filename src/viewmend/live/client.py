@@ -43,10 +43,8 @@ class ServerSocket:
         try:
             self._socket = self._context.enter_context(connect(address, max_size=None, compression=None))
         except InvalidStatus as refused:
-            reason, status = (
-                bytes(refused.response.body or b"").decode(errors="replace"),
-                refused.response.status_code,
-            )
+            reason = bytes(refused.response.body or b"").decode(errors="replace")
+            status = refused.response.status_code
             kind = ConnectionLostError if status >= 500 else ConnectionError
             raise kind(f"the server refuses ({status}): {reason[:400]}") from None
         except (OSError, InvalidHandshake, ConnectionClosed) as error:
@@ -136,7 +134,8 @@ class Client(Connection):
     """Number of connections so far."""
 
     def __enter__(self) -> "Client":
-        self._looks, self._shown = 0, -1
+        self._looks = 0
+        self._shown = -1
         self._look: dict[str, Any] = {}
         self._on_air = False
         self._clock: dict[str, Any] = {}
@@ -147,7 +146,9 @@ class Client(Connection):
     def _connect(self) -> None:
         self._socket = ServerSocket(f"{self.url}/ws", self.token)
         self.connections += 1
-        self._max_per_s, self._credit, self._credited_at = math.inf, 1.0, time.monotonic()
+        self._max_per_s = math.inf
+        self._credit = 1.0
+        self._credited_at = time.monotonic()
         self.send("hello", version=VERSION, codecs=["jpeg"])
         self.messages.pop("welcome", None)
         end = time.monotonic() + self.timeout_s
@@ -176,7 +177,8 @@ class Client(Connection):
     def send(self, kind: str, **values: object) -> None:
         """Send a message of the protocol; waits as long as the server would drop it for coming too soon."""
         if self._max_per_s < math.inf:
-            now, rate = time.monotonic(), self._max_per_s
+            now = time.monotonic()
+            rate = self._max_per_s
             self._credit = min(rate, self._credit + (now - self._credited_at) * rate) - 1
             self._credited_at = now
             if self._credit < 0:

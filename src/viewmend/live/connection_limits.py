@@ -26,20 +26,24 @@ MAX_UNAUTHENTICATED = 128
 """Unauthenticated connections at a time; the oldest one is closed when another arrives."""
 MAX_UNAUTHENTICATED_BYTES = 262_144
 """Bytes that an unauthenticated connection may send in all."""
-MESSAGE_SLACK_BYTES, MESSAGE_SLACK_BYTES_PER_S = 524_288, 1000
-"""Bytes on a WebSocket in addition to the message that is read: of the next message, and of
-pings and pongs."""
+MESSAGE_SLACK_BYTES = 524_288
+"""Bytes that may arrive on a WebSocket beyond the message that is read: parts of the next message."""
+MESSAGE_SLACK_BYTES_PER_S = 1000
+"""Bytes per second that may arrive on a WebSocket for pings and pongs."""
 IDLE_S = 10.0
 """A connection without a complete request is closed after this many seconds."""
 HANDSHAKE_S = 1.0
 """A WebSocket handshake that uvicorn cannot parse is closed after this long."""
-UNREAD_S, UNREAD_BYTES = 20.0, 64_000
-"""A client with unread data has to read this many bytes of it within this many seconds."""
+UNREAD_S = 20.0
+"""Seconds within which a client with unread data has to read `UNREAD_BYTES` of it."""
+UNREAD_BYTES = 64_000
+"""Bytes that a client with unread data has to read within `UNREAD_S`."""
 PIECE_BYTES = 4096
 """Unauthenticated input is handed to uvicorn in pieces of at most this size."""
-PAUSE_FACTOR, MIN_PAUSE_S = 4.0, 0.005
-"""After a turn, unauthenticated clients wait for this multiple of its processor time, and at least
-for this long."""
+PAUSE_FACTOR = 4.0
+"""After a turn, unauthenticated clients wait for this multiple of its processor time."""
+MIN_PAUSE_S = 0.005
+"""After a turn, unauthenticated clients wait for at least this many seconds."""
 TOO_LARGE = b"\x88\x02\x03\xf1"
 """A WebSocket close frame with code 1009, message too large."""
 STATE_KEY = "connection"
@@ -64,7 +68,9 @@ class FairScheduler:
 
         `spent` is the thread's processor time: other programs must not prolong the pauses.
         """
-        self._now, self._call_later, self._spent = now, call_later, spent
+        self._now = now
+        self._call_later = call_later
+        self._spent = spent
         self._waiting: deque[Callable[[], None]] = deque()
         self._free_at_s = 0.0
         self._is_planned = False
@@ -129,7 +135,8 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
 
     def authenticate(self, max_message_bytes: int) -> None:
         """Lift the limits for unauthenticated clients; WebSocket messages may have `max_message_bytes` from now on."""
-        self.authenticated, self._max_message_bytes = True, max_message_bytes
+        self.authenticated = True
+        self._max_message_bytes = max_message_bytes
         asyncio.get_running_loop().call_soon(self._forward)
 
     def is_stalled(self, now: float) -> bool:
@@ -137,7 +144,8 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         self.message_bytes = max(0, self.message_bytes - MESSAGE_SLACK_BYTES_PER_S)
         left = self.get_write_buffer_size()
         if left == 0 or left <= self._unread_bytes - UNREAD_BYTES:
-            self._read_at_s, self._unread_bytes = now, left
+            self._read_at_s = now
+            self._unread_bytes = left
         self._unread_bytes = max(self._unread_bytes, left)
         return now - self._read_at_s >= UNREAD_S
 
@@ -187,7 +195,8 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
     def resume_writing(self) -> None:
         """Go on after nearly all output was read."""
         self._output_paused = False
-        self._unread_bytes, self._read_at_s = self.get_write_buffer_size(), self._limits.now()
+        self._unread_bytes = self.get_write_buffer_size()
+        self._read_at_s = self._limits.now()
         self._uvicorn.resume_writing()
         self._forward()
 
@@ -217,7 +226,8 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         self._forward()
 
     def _deliver(self, max_bytes: int) -> None:
-        data, self._held = self._held[:max_bytes], self._held[max_bytes:]
+        data = self._held[:max_bytes]
+        self._held = self._held[max_bytes:]
         self.message_bytes += len(data)
         if self._is_websocket and self.message_bytes > self._max_message_bytes + MESSAGE_SLACK_BYTES:
             self.write(TOO_LARGE)
@@ -234,7 +244,8 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
 
     def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
         """Upgrade to a WebSocket."""
-        self._uvicorn, self._is_websocket = protocol, True
+        self._uvicorn = protocol
+        self._is_websocket = True
         asyncio.get_running_loop().call_later(HANDSHAKE_S, lambda: self.requests or self.close())
 
     def pause_reading(self) -> None:

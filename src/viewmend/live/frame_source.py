@@ -85,7 +85,8 @@ class Clock:
     def change(self, change: ClockChange, span: Span) -> None:
         """Apply a viewer's message `clock`."""
         if change.seek is not None:
-            self.position, self.live = span.clamp(change.seek), False
+            self.position = span.clamp(change.seek)
+            self.live = False
         if change.speed is not None and not span.live:
             self.speed = change.speed
             self.live = self.live and change.speed == 1
@@ -93,7 +94,9 @@ class Clock:
             self.playing = change.playing
             self.live = self.live and change.playing
         if change.live:
-            self.live, self.playing, self.speed = True, True, 1.0
+            self.live = True
+            self.playing = True
+            self.speed = 1.0
 
     def frame(self, span: Span) -> int:
         """The index of the frame to show; -1 while there is none."""
@@ -216,10 +219,13 @@ class RecordedSource(FrameSource):
         memory_mb: float = 1500.0,
     ) -> None:
         super().__init__(Span())
-        self._open_capture, self._fps, self._generated = open_capture, fps, generated
+        self._open_capture = open_capture
+        self._fps = fps
+        self._generated = generated
         self._cache = FrameCache(memory_mb, by_last_use=True)
         self._lock = threading.Condition()
-        self._wanted, self._stopped = 0, False
+        self._wanted = 0
+        self._stopped = False
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
 
     def start(self) -> None:

@@ -23,7 +23,8 @@ class Server:
     def __init__(self, server: LiveServer, config: ServerConfig) -> None:
         """Set up; `bind` takes the port."""
         self.limits = ConnectionLimits()
-        self._host, self._port = config.host, config.port
+        self._host = config.host
+        self._port = config.port
         self._socket: socket.socket | None = None
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(

@@ -58,14 +58,16 @@ def home_view(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     `center` is the subject's, in metres; `up` the up axis of the world, None to estimate it from the cameras.
     """
     cameras = cameras.to("cpu")
-    center, up = center.cpu().float(), upright(cameras) if up is None else (up / up.norm()).cpu().float()
+    center = center.cpu().float()
+    up = upright(cameras) if up is None else (up / up.norm()).cpu().float()
     front, side = horizontal_axes(up)
     offsets = cameras.centers - center
     distance = offsets.norm(dim=-1)
     azimuths = torch.rad2deg(torch.atan2(offsets @ side, offsets @ front))
     after = ((azimuths - azimuths[0]) % 360).sort().values
     gaps = torch.cat([after, after.new_tensor([360.0])]).diff()
-    widest, others = int(gaps.argmax()), gaps.sort().values[:-1]
+    widest = int(gaps.argmax())
+    others = gaps.sort().values[:-1]
     if not len(others) or float(gaps[widest]) >= ARC_GAP * float(others[-1]):
         ahead = (
             float(after[widest] + gaps[widest] / 2) + 180
@@ -91,13 +93,15 @@ def view_camera(asked: Camera, home: HomeView, size_px: tuple[int, int], scale: 
         pose = rigid(torch.tensor(asked.R).view(3, 3), torch.tensor(asked.T))
     else:
         center = home.center if asked.target is None else torch.tensor(asked.target)
-        azimuth, elevation = math.radians(asked.azimuth), math.radians(asked.elevation)
+        azimuth = math.radians(asked.azimuth)
+        elevation = math.radians(asked.elevation)
         flat = math.cos(azimuth) * home.front + math.sin(azimuth) * home.side
         distance_m = home.distance_m if asked.distance is None else asked.distance
         eye = center + distance_m * (math.cos(elevation) * flat + math.sin(elevation) * home.up)
         pose = look_at(eye, center, home.up)
     if asked.fx is not None:
-        cx, cy = width / 2 if asked.cx is None else asked.cx, height / 2 if asked.cy is None else asked.cy
+        cx = width / 2 if asked.cx is None else asked.cx
+        cy = height / 2 if asked.cy is None else asked.cy
         K = [[asked.fx, 0.0, cx], [0.0, asked.fy or asked.fx, cy], [0.0, 0.0, 1.0]]
         camera = Cameras(("view",), torch.tensor([K]), pose[None], torch.tensor([[width, height]]))
     else:
@@ -129,7 +133,8 @@ def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> 
 
 def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:
     """Cameras in the protocol's form."""
-    poses, centers = cameras.camera_from_world.cpu(), cameras.centers.cpu()
+    poses = cameras.camera_from_world.cpu()
+    centers = cameras.centers.cpu()
     return [
         {
             "name": name,

@@ -56,7 +56,8 @@ TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
 Quality = Annotated[int, Meta(ge=30, le=95)]
 Colour = Annotated[str, Meta(pattern="^[0-9a-f]{6}\\Z")]
 """Red, green and blue in hexadecimal."""
-BLACK, WHITE = "000000", "ffffff"
+BLACK = "000000"
+WHITE = "ffffff"
 ShortText = Annotated[str, Meta(max_length=40)]
 Names = Annotated[tuple[ShortText, ...], Meta(max_length=128)]
 
@@ -212,7 +213,8 @@ class ShowView(Struct, frozen=True):
 
 def parse(text: str, limits: Limits) -> Message:
     """Parse a client's message; ProtocolError if it is malformed or exceeds the limits."""
-    if (size := len(text.encode())) > limits.max_message_bytes:
+    size = len(text.encode())
+    if size > limits.max_message_bytes:
         raise ProtocolError(f"expected at most {limits.max_message_bytes} bytes, got {size}; send less")
     message: Message = read_message(text, Message)
     if isinstance(message, Look):
@@ -224,7 +226,8 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
     """Convert JSON text, or parsed JSON, to `kind`, as `untrusted_input.typed`; ProtocolError if it does not match."""
     if isinstance(message, str | bytes):
         opening = ("[", "{") if isinstance(message, str) else (b"[", b"{")
-        if (nested := sum(map(message.count, opening))) > MAX_NESTED:  # pyright: ignore[reportArgumentType]
+        nested = sum(map(message.count, opening))  # pyright: ignore[reportArgumentType]
+        if nested > MAX_NESTED:
             raise ProtocolError(
                 f"expected at most {MAX_NESTED} lists and objects in a message, got {nested}; send fewer"
             )

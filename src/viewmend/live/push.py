@@ -163,11 +163,10 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
             raise ProtocolError("expected unique camera names, got one twice; rename it")
         if self.up is not None and sum(x * x for x in self.up) < 1e-12:
             raise ProtocolError("expected 'up' as a direction, got a zero vector; leave it out")
-        widest, highest = (
-            max(camera.width for camera in self.cameras),
-            max(camera.height for camera in self.cameras),
-        )
-        if (pixels := len(self.cameras) * widest * highest) > MAX_PIXELS:
+        widest = max(camera.width for camera in self.cameras)
+        highest = max(camera.height for camera in self.cameras)
+        pixels = len(self.cameras) * widest * highest
+        if pixels > MAX_PIXELS:
             raise ProtocolError(
                 f"expected cameras x widest x highest of at most {MAX_PIXELS} pixels, got {pixels}; push smaller images"
             )
@@ -231,7 +230,8 @@ def _decode_image(
     expected = f"camera '{name}': expected {kind} of {width} x {height} pixels"
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
-    if (size_px := size_from_header(data)) is not None and size_px != (
+    size_px = size_from_header(data)
+    if size_px is not None and size_px != (
         width,
         height,
     ):  # checked before decoding

@@ -33,8 +33,11 @@ from viewmend.utils.cancellation import CancelledError
 from viewmend.utils.timing import StageTimes, exact_times
 
 WARM_UP_PX = 64
-MAX_VARIANTS, VARIANT_MB = 3, 200.0
-"""Streams of other models or fewer cameras that are kept, and the memory of each."""
+"""Height and width of the view that is rendered before the first request."""
+MAX_VARIANTS = 3
+"""Number of streams of other models or fewer cameras that are kept."""
+VARIANT_MB = 200.0
+"""Memory of each of these streams, in MB."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ class Renderer:
             precision: number format of models that viewers compare, as in `load_inpainter`.
         """
         self._source = source
-        self._inpainter, self._error_model = inpainter, error_model
+        self._inpainter = inpainter
+        self._error_model = error_model
         self._config = config or StreamConfig()
         self.ladder = ladder_for(inpainter)
         self._device = device
@@ -178,7 +182,9 @@ class Renderer:
         rig_json["assets"] = self.assets_version if self._draws_in_page else None
         self.rig_json = rig_json | home.as_json() | {"fps": self._source.span.fps or None}
         self._variants.clear()
-        self._rig, self._stream, self.home = rig, stream, home
+        self._rig = rig
+        self._stream = stream
+        self.home = home
         return True
 
     @exact_times()
@@ -206,7 +212,8 @@ class Renderer:
         extra = tuple(self._render_proxy(cached, camera, request.extra_modes) for camera in cameras)
         times = sum((v.times for v in views), StageTimes(rendering=1000 * (time.perf_counter() - start)))
         completed = [view.completed for view in views]
-        inpainter, scored = self._inpainter, completed[0]
+        inpainter = self._inpainter
+        scored = completed[0]
         if request.model is not None:
             others = [
                 self._complete_by(request.model, cached, camera, without, request.quality)
@@ -215,7 +222,8 @@ class Renderer:
             for images, other in zip(extra, others, strict=True):
                 images["compared"] = torch.cat([other.rgb, other.opacity[None]])
             times += StageTimes(inpainting=1000 * (time.perf_counter() - start) - times.rendering)
-            inpainter, scored = self._models[request.model], others[0]
+            inpainter = self._models[request.model]
+            scored = others[0]
         psnr_db = None
         if truth is not None:
             background = inpainter.background or self._config.background
@@ -276,13 +284,16 @@ class Renderer:
         assert self._stream is not None, "there is a rig"
         if model is None and not without:
             return self._stream
-        key, config = (model, without), replace(self._config, memory_mb=VARIANT_MB)
+        key = (model, without)
+        config = replace(self._config, memory_mb=VARIANT_MB)
         if key not in self._variants:
-            inpainter, errors = self._inpainter, self._error_model
+            inpainter = self._inpainter
+            errors = self._error_model
             if model is not None:  # by the error rule that it is made for
                 if model not in self._models:
                     self._models[model] = load_inpainter(model, self._device, self._precision)
-                inpainter, errors = self._models[model], errors if errors is not None else self._inpainter
+                inpainter = self._models[model]
+                errors = errors if errors is not None else self._inpainter
                 config = replace(config, render=replace(config.render, error_rule=None))
             self._variants[key] = Stream(inpainter, config, self._stream.bounds, errors)
         self._variants.move_to_end(key)
@@ -326,7 +337,8 @@ class Renderer:
 
     def _render_proxy(self, cached: CachedFrame, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Images of the proxy; the vertex colours are computed once per frame."""
-        proxy, images = cached.proxy, {}
+        proxy = cached.proxy
+        images = {}
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         if "hull" in modes:
             images["hull"] = shaded_hull(proxy, camera)
@@ -364,7 +376,8 @@ class Renderer:
         if not quality.mend:
             return stream.view(camera, viewer, index, quality)
         try:
-            view, self.model_error = stream.view(camera, viewer, index, quality), None
+            view = stream.view(camera, viewer, index, quality)
+            self.model_error = None
         except CancelledError:
             raise
         except Exception as error:

@@ -12,10 +12,12 @@ from viewmend.live.protocol import ProtocolError
 from viewmend.live.registry import SessionRegistry
 from viewmend.utils.heap import resident_bytes
 
-MAX_BODY_BYTES, BODY_S = 1_000_000, 10.0
-"""The largest request body, and the time in which it has to arrive."""
+MAX_BODY_BYTES = 1_000_000
+"""Size of the largest request body, in bytes."""
+BODY_S = 10.0
+"""Seconds within which a request's body has to arrive."""
 MAX_AGE_S = 31_536_000
-"""How long assets that never change may be cached."""
+"""Seconds for which assets that never change may be cached."""
 POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
     "worker-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -86,7 +88,8 @@ async def read_body(request: Request) -> bytearray | None:
 def metrics_text(registry: SessionRegistry) -> str:
     """All counters and gauges in the text format of Prometheus."""
     service = registry.service
-    source, counts = service.source, service.counts
+    source = service.source
+    counts = service.counts
     ready = int(service.is_ready and source.status.state == "ready")
     dropped = sum(session.dropped for session in list(registry.sessions))
     stages = {label(stage=stage): ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"}
@@ -112,7 +115,8 @@ def metrics_text(registry: SessionRegistry) -> str:
     ]
     for extension in registry.extensions:
         lines += extension.metrics()
-    if cameras := source.camera_counts():
+    cameras = source.camera_counts()
+    if cameras:
         up = {label(camera=name): counts["up"] for name, counts in cameras.items()}
         images = {
             label(camera=name, event=event): count
@@ -124,10 +128,12 @@ def metrics_text(registry: SessionRegistry) -> str:
         lines += metric(
             "viewmend_camera_pictures_total", "counter", "Images of each camera by event.", images
         )
-    if (spread_ms := source.spread_ms) is not None:
+    spread_ms = source.spread_ms
+    if spread_ms is not None:
         text = "Time between the first and the last image of the newest frame."
         lines += metric("viewmend_cameras_apart_seconds", "gauge", text, spread_ms / 1000)
-    if (resident := resident_bytes()) is not None:
+    resident = resident_bytes()
+    if resident is not None:
         lines += metric("process_resident_memory_bytes", "gauge", "Resident memory size in bytes.", resident)
     return "\n".join(lines) + "\n"
 

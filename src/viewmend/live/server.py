@@ -35,10 +35,14 @@ from viewmend.live.video import video_codecs
 from viewmend.models.checkpoint import shipped_models
 from viewmend.utils.plugins import import_object
 
-IMAGE_S, SOURCE_IMAGE_S, EXPORT_S = 60.0, 5.0, 3600.0
-"""Time limits of single images, cameras' own images, and camera paths."""
+IMAGE_S = 60.0
+"""Time limit of a single image, seconds."""
+SOURCE_IMAGE_S = 5.0
+"""Time limit of a camera's own image, seconds."""
+EXPORT_S = 3600.0
+"""Time limit of a camera path, seconds."""
 MAX_IMAGES = 4
-"""Single images that are rendered at a time."""
+"""Number of single images that are rendered at the same time."""
 TOKEN_EXPECTED = "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN"
 TOO_MANY_IMAGES = f"expected at most {MAX_IMAGES} images at a time; try again"
 EXTENSIONS = {
@@ -84,7 +88,8 @@ class LiveServer:
     """The routes, and what they share."""
 
     def __init__(self, service: RenderService, config: ServerConfig) -> None:
-        self._service, self._config = service, config
+        self._service = service
+        self._config = config
         self._access = AccessControl(config.host, config.token, config.public_url)
         self._files = page_files()
         self.assets = AssetStore(service.source.read, service.renderer.make_assets)
@@ -150,7 +155,8 @@ class LiveServer:
         """The handler for requests with the token that come from the server's own page."""
 
         async def guarded(request: Request) -> Response:
-            if foreign := self._access.find_foreign_origin(request):
+            foreign = self._access.find_foreign_origin(request)
+            if foreign:
                 return error_response(403, foreign)
             if await self._access.has_token(request):
                 authenticate(request)
@@ -236,7 +242,8 @@ class LiveServer:
     async def _turntable(self, request: Request) -> Response:
         asked: TurntableQuery = read_message(dict(request.query_params), TurntableQuery, strict=False)
         self._config.limits.check_size(asked.width, asked.height)
-        source, home = self._service.source, self._service.renderer.home
+        source = self._service.source
+        home = self._service.renderer.home
         if home is None or source.rig is None:
             return error_response(503, "there is no frame yet; see /health")
         points = []
@@ -260,7 +267,8 @@ class LiveServer:
     async def _asset(self, request: Request) -> Response:
         given = {**request.query_params, **request.path_params}
         asked: AssetQuery = read_message(given, AssetQuery, strict=False)
-        span, version = self._service.source.span, self._service.renderer.assets_version
+        span = self._service.source.span
+        version = self._service.renderer.assets_version
         if version is None or not span.first <= asked.time < span.end:
             there = (
                 f"from {span.first} to {span.end - 1}"
@@ -299,13 +307,15 @@ class LiveServer:
             self._path_job = job
             video = await self._wait(request, job, EXPORT_S, "the path took too long; request fewer poses")
         finally:
-            self._is_exporting, self._path_job = False, None
+            self._is_exporting = False
+            self._path_job = None
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float, late: str) -> Result:
         """The result of a job; TimeoutError with the message `late` after the limit, or if the client disconnects."""
         self._service.join(job)
-        end, result = time.monotonic() + limit_s, asyncio.wrap_future(job.done)
+        end = time.monotonic() + limit_s
+        result = asyncio.wrap_future(job.done)
         try:
             while not result.done():
                 await asyncio.wait([result], timeout=0.5)
@@ -318,7 +328,8 @@ class LiveServer:
 
     async def _check(self, socket: WebSocket) -> bool:
         """Whether a WebSocket may be accepted; if not, its handshake is answered by the reason."""
-        if foreign := self._access.find_foreign_origin(socket):
+        foreign = self._access.find_foreign_origin(socket)
+        if foreign:
             await socket.send_denial_response(error_response(403, foreign))
         elif not await self._access.has_token(socket):
             await socket.send_denial_response(error_response(401, TOKEN_EXPECTED))

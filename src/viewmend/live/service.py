@@ -19,13 +19,15 @@ from viewmend.utils.heap import HeapTrimmer
 
 TICK_S = 0.004
 """Seconds between checks of the sessions' clocks."""
-LOADING_S, IDLE_S = 0.05, 0.5
-"""The same before the first frame, and while no session wants a view; the first that does
-wakes the thread."""
+LOADING_S = 0.05
+"""Seconds between these checks before the first frame."""
+IDLE_S = 0.5
+"""Seconds between these checks while no session wants a view; the first that does wakes the thread."""
 AFTER_ERROR_S = 0.5
+"""Seconds of rest after an error."""
 Session = ViewerSession | RenderJob[Any]
-"""Requests views. The render thread makes all calls, with the service's lock but for `deliver` and
-`is_cancelled`."""
+"""What requests views. The render thread makes all calls, and holds the service's lock in all of
+them but `deliver` and `is_cancelled`."""
 
 log = logging.getLogger("viewmend.live")
 
@@ -36,7 +38,9 @@ class RenderService:
     def __init__(
         self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic
     ) -> None:
-        self.renderer, self.source, self.now = renderer, source, now
+        self.renderer = renderer
+        self.source = source
+        self.now = now
         self.lock = threading.Condition()
         self.changed: Callable[[], None] = lambda: None
         """Called, on any thread, when the source has changed."""
@@ -109,7 +113,8 @@ class RenderService:
                 worked = self._prepare() or self.serve_next()
             except Exception as error:  # the thread goes on
                 log.warning("while preparing: %s", error)
-                self.error, worked = f"{type(error).__name__}: {error}"[:400], False
+                self.error = f"{type(error).__name__}: {error}"[:400]
+                worked = False
                 with self.lock:
                     self.lock.wait_for(lambda: self._stopped, AFTER_ERROR_S)
             trimmer.trim_if_due(idle=not worked)
@@ -130,7 +135,8 @@ class RenderService:
 
     def serve_next(self) -> bool:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
-        now, span = self.now(), self.source.span
+        now = self.now()
+        span = self.source.span
         if not self._is_wanted or not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:

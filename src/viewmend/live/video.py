@@ -64,7 +64,9 @@ class VideoStream:
         image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
         kind = (codec, image.shape[1], image.shape[0])
         if self._context is None or kind != self._kind:
-            self._context, self._kind, self._count = _open(*kind), kind, 0
+            self._context = _open(*kind)
+            self._kind = kind
+            self._count = 0
         frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24").reformat(
             format="yuv420p"
         )
@@ -81,7 +83,8 @@ def _open(codec: str, width: int, height: int) -> "VideoCodecContext":
 
     context = av.CodecContext.create(ENCODERS[codec], "w")
     assert isinstance(context, av.VideoCodecContext)
-    context.width, context.height = width, height
+    context.width = width
+    context.height = height
     context.pix_fmt = "yuv420p"
     tag_colours(context)
     context.time_base = Fraction(1, 30)

@@ -162,7 +162,8 @@ def _converted(published: Published, archive: Path, folder: Path) -> Weights:
 def _check_hash(path: Path, sha256: str, what: str) -> None:
     if not path.is_file():
         raise DamagedWeightsError(f"{path}: expected {what}, found no file; check the path")
-    if (found := file_sha256(path)) != sha256:
+    found = file_sha256(path)
+    if found != sha256:
         raise MismatchedWeightsError(
             f"{path}: expected {what} with SHA-256 {sha256}, got {path.stat().st_size} bytes with {found}; it is "
             "truncated or another file, get it again"

@@ -295,7 +295,8 @@ class Inpainter:
         """
         given = "black" if self.background is not None else background
         made = self.step(to_background(given, view), context, state)
-        if fault := _fault(made, view):
+        fault = _fault(made, view)
+        if fault:
             raise ValueError(
                 f"{type(self).__name__}: expected `step` to return (CompletedView, State), with images of floats in "
                 f"[0, 1], of the view's height and width {tuple(view.mask.shape)}, got {fault}; correct `step`, or use "

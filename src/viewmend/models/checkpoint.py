@@ -31,7 +31,9 @@ PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 SHIPPED = Path(__file__).parents[1] / "weights"
 RAYS = "rays"
 """The shipped model that has no folder of its own: the ray fill within `views`."""
-WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+WEIGHTS = "model.safetensors"
+CONFIG = "config.json"
+CARD = "README.md"
 
 
 class MissingCheckpointError(WeightsError):
@@ -80,7 +82,8 @@ def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -
     config = _read_config(folder / CONFIG)
     with torch.device("meta"):  # allocates nothing before the file is known to be large enough
         needed = sum(weight.numel() for weight in build(config).parameters())
-    if needed > (size := (folder / WEIGHTS).stat().st_size):
+    size = (folder / WEIGHTS).stat().st_size
+    if needed > size:
         read_weights(folder / WEIGHTS)  # reports a damaged file as such
         raise MismatchedWeightsError(
             f"{folder}: expected the {needed} weights of its {CONFIG}, got {size} bytes of {WEIGHTS}; copy both files"
@@ -128,7 +131,8 @@ def model_folder(name_or_path: str | Path) -> Path:
         raise MissingCheckpointError(
             f"expected a folder or one of the shipped models {list(shipped_models())}, got {name!r}; check it"
         )
-    if missing := [name for name in (WEIGHTS, CONFIG) if not (folder / name).is_file()]:
+    missing = [name for name in (WEIGHTS, CONFIG) if not (folder / name).is_file()]
+    if missing:
         raise MissingCheckpointError(
             f"expected a model's folder with {WEIGHTS} and {CONFIG} in {folder}, {' and '.join(missing)} missing; copy "
             f"the whole folder, or name one of the shipped models {list(shipped_models())}"

@@ -21,8 +21,10 @@ Plane = Float[Tensor, "height width"]
 RELIABLE = 0.25
 """The smallest alpha at which a pixel keeps its own colour where the target mask makes it
 opaque."""
-BLOCKS_PX, OPAQUE_ENOUGH = (4, 8, 16, 32, 64, 128), 0.1
-"""Sizes of the blocks whose mean colour others take, and the mean alpha that a block must have."""
+BLOCKS_PX = (4, 8, 16, 32, 64, 128)
+"""Sizes of the blocks whose mean colour replaces that of pixels without a reliable one."""
+OPAQUE_ENOUGH = 0.1
+"""Smallest mean alpha of a block whose colour is used."""
 
 
 def composite(background: Background, rgb: Image, alpha: Plane) -> Image:
@@ -94,10 +96,12 @@ def opaque_in_mask(completed: CompletedView) -> CompletedView:
     unreliable, because their alpha is low, take the mean colour of the smallest block around them
     that is opaque enough.
     """
-    view, alpha = completed.view, completed.alpha
+    view = completed.view
+    alpha = completed.alpha
     if view.target_mask is None or alpha is None:
         return completed
-    straight, found = completed.rgb / alpha.clamp(min=RELIABLE), alpha >= RELIABLE
+    straight = completed.rgb / alpha.clamp(min=RELIABLE)
+    found = alpha >= RELIABLE
     premultiplied = torch.cat([completed.rgb, alpha[None]])[None]
     for block in BLOCKS_PX:
         sides = [max(1, side // block) for side in alpha.shape]

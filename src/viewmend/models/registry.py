@@ -117,7 +117,8 @@ def _make(name: str, device: str, precision: str) -> object:
         return load_inpainter(name, device, precision)
     if ".py:" in name:
         return _call(load_from_file(name), name, device)
-    if (family := re.split("[-@]", name)[0]) in FAMILIES:
+    family = re.split("[-@]", name)[0]
+    if family in FAMILIES:
         try:
             return import_object(FAMILIES[family])(name, device)
         except MissingWeightsError as error:

@@ -79,7 +79,8 @@ def fill(rgb: Image, missing: Pixels, subject: Pixels) -> Image:
 def from_near(rgb: Image, known: Pixels, missing: Pixels) -> tuple[Image, Pixels]:
     """Missing pixels as the weighted mean of the known ones within reach; and which missing pixels have any."""
     near = _sum_around(torch.cat([rgb * known, known[None].to(rgb)]))
-    colour, weight = near[:-1], near[-1]
+    colour = near[:-1]
+    weight = near[-1]
     reached = missing & (weight > 0)
     return torch.where(reached, colour / weight.clamp_min(1e-6), rgb), reached
 
@@ -102,7 +103,8 @@ def _sum_around(image: Image) -> Image:
 def spread(pixels: Pixels) -> Pixels:
     """Where a square of `THIN_PX` around a pixel contains any of them; there are none outside the image."""
     for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
-        around, length = F.pad(pixels, pad), pixels.shape[axis]
+        around = F.pad(pixels, pad)
+        length = pixels.shape[axis]
         pixels = torch.stack([around.narrow(axis, i, length) for i in range(THIN_PX)]).any(0)
     return pixels
 

@@ -101,7 +101,9 @@ def _weigh(
     if usable <= 0:
         return 0.0
     scale = 1 / max(255 * usable, 1e-6)
-    colour[view, 0], colour[view, 1], colour[view, 2] = red * scale, green * scale, blue * scale
+    colour[view, 0] = red * scale
+    colour[view, 1] = green * scale
+    colour[view, 2] = blue * scale
     return usable * facing ** powers[0] * agreeing ** powers[1]
 
 

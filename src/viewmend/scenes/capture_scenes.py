@@ -261,7 +261,8 @@ def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple
             raise ValueError(
                 f"{file}: expected the capture {path}, got none; put the file where its paths hold"
             )
-        if (now := _calibration_sha256(path, scene.format)) != scene.calibration_sha256:
+        now = _calibration_sha256(path, scene.format)
+        if now != scene.calibration_sha256:
             raise ValueError(
                 f"{path}: expected the calibration that {file.name} was made with, {scene.calibration_sha256[:12]}, "
                 f"got another, {now[:12]}; take that version of the data, or make splits of your own"

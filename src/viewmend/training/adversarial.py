@@ -65,7 +65,8 @@ class Discriminator(nn.Module):
         Images of one size are processed as one batch. In training mode each call makes one step of
         power iteration, so pass real and completed images in the same call.
         """
-        if small := [tuple(image.shape) for image in images if min(image.shape[-2:]) < MIN_SIZE_PX]:
+        small = [tuple(image.shape) for image in images if min(image.shape[-2:]) < MIN_SIZE_PX]
+        if small:
             raise ValueError(
                 f"expected images of at least {MIN_SIZE_PX} x {MIN_SIZE_PX} pixels, got shapes {small}; leave them out"
             )

@@ -188,7 +188,8 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
         ValueError: data reserved for tests is requested.
     """
     studio = StudioRigs(config, frames, seed, split)
-    if not (folders := recordings(split, config.captures)):
+    folders = recordings(split, config.captures)
+    if not folders:
         return studio
     opened = [own for folder in folders for own in open_training_captures(folder, config.hold_out)]
     # Only for its checks: each held-out camera has its own alignment.

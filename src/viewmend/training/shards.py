@@ -205,7 +205,8 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         name = value["kind"]
         kind = KINDS[name]
         made = kind(**{str(n): _put_together(part, tensors) for n, part in value["fields"].items()})
-        if wrong := [field for field, hint in _hints(kind).items() if not _fits(getattr(made, field), hint)]:
+        wrong = [field for field, hint in _hints(kind).items() if not _fits(getattr(made, field), hint)]
+        if wrong:
             raise TypeError(f"{wrong[0]} of {name} has another type")
         return made
     return value

@@ -92,7 +92,8 @@ def remove_partial_file(path: Path) -> None:
     """Remove temporary files of one file that killed runs left, in a folder that others may write to."""
     name = re.compile(rf"{re.escape(TEMPORARY)}(\d+)-{re.escape(path.name)}")
     for entry in path.parent.iterdir() if path.parent.is_dir() else ():
-        if (leftover := name.fullmatch(entry.name)) and not is_running(leftover[1]) and not entry.is_dir():
+        leftover = name.fullmatch(entry.name)
+        if leftover and not is_running(leftover[1]) and not entry.is_dir():
             entry.unlink(missing_ok=True)
 
 

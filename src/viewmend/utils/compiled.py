@@ -26,7 +26,8 @@ def kernel(function: Any = None, *, cache: bool = True, **options: Any) -> Any:
     try:
         compiled.enable_caching()
     except RuntimeError:  # numba found no folder that it can write to
-        if folder := _private_folder():
+        folder = _private_folder()
+        if folder:
             config: Any = numba.config
             before = config.CACHE_DIR
             config.CACHE_DIR = str(folder)

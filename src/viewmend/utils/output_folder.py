@@ -54,7 +54,8 @@ class OutputFolder:
             raise ValueError(
                 f"{self.path}: expected a folder for the results, got a file; choose another --out"
             )
-        if (hidden := self.path / HIDDEN).is_symlink() or (hidden.exists() and not hidden.is_dir()):
+        hidden = self.path / HIDDEN
+        if hidden.is_symlink() or (hidden.exists() and not hidden.is_dir()):
             raise ValueError(
                 f"{hidden}: expected a folder that a run has made, got something else; move it away"
             )

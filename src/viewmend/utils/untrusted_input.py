@@ -81,7 +81,8 @@ def read_json(text: str | bytes) -> Any:
             takes too long.
     """
     opening = (b"[", b"{") if isinstance(text, bytes) else ("[", "{")
-    if (parts := sum(map(text.count, opening))) > MOST_PARTS:  # pyright: ignore[reportArgumentType]
+    parts = sum(map(text.count, opening))  # pyright: ignore[reportArgumentType]
+    if parts > MOST_PARTS:
         raise ValueError(
             f"expected JSON of at most {MOST_PARTS} lists and objects, got {parts}; is it the right file?"
         )
@@ -134,7 +135,8 @@ def _explained(error: str, value: Any, kind: Any, next_step: str) -> str:
     error, _, path = error.partition(" - at `$")
     place, got = _follow(value, path)
     text = error
-    if missing := re.fullmatch(r"Object missing required field `(.*)`", error):
+    missing = re.fullmatch(r"Object missing required field `(.*)`", error)
+    if missing:
         place = f"{place}{missing[1]}: "
         text = "expected a value, got nothing"
         next_step = "add the key"

@@ -52,10 +52,13 @@ class FocalAttention(nn.Module):
         pooled: Float[Tensor, "sample frame window_row window_column dim"],
     ) -> Float[Tensor, "sample frame row column dim"]:
         """The frames' tokens after attention to those of all frames; `pooled` has one token of each window."""
-        dim, grid, device = tokens.shape[-1], (pooled.shape[2], pooled.shape[3]), tokens.device
+        dim = tokens.shape[-1]
+        grid = (pooled.shape[2], pooled.shape[3])
+        device = tokens.device
 
         # Keys and values of every window: the same places in all frames.
-        weight, bias = self.qkv.weight.split([dim, 2 * dim]), self.qkv.bias.split([dim, 2 * dim])
+        weight = self.qkv.weight.split([dim, 2 * dim])
+        bias = self.qkv.bias.split([dim, 2 * dim])
         fine, coarse = (F.linear(x, weight[1], bias[1]).flatten(2, 3) for x in (tokens, pooled))
         own, rolled = window_places(grid)
         places = torch.cat([own, rolled[:, self.valid_ind_rolled.to(rolled.device)]], 1).to(device)
@@ -77,7 +80,8 @@ def window_places(grid: tuple[int, int]) -> tuple[Int[Tensor, "window own"], Int
 
     Shifts wrap around the frame.
     """
-    rows, columns = grid[0] * WINDOW[0], grid[1] * WINDOW[1]
+    rows = grid[0] * WINDOW[0]
+    columns = grid[1] * WINDOW[1]
     places = torch.arange(rows * columns).view(rows, columns)
 
     def windows(of: Tensor) -> Tensor:
@@ -176,7 +180,8 @@ class E2FGVI(nn.Module):
             raise ValueError(
                 f"expected 1 to {frames.shape[1]} local frames of {frames.shape[1]}, got {local}"
             )
-        clips, flows = frames.shape[:2], self.flows(frames[:, :local])
+        clips = frames.shape[:2]
+        flows = self.flows(frames[:, :local])
         features = self.encoder(frames.flatten(0, 1)).unflatten(0, clips)
         consecutive = self.feat_prop_module(features[:, :local], flows.to_next, flows.to_previous)
         features = torch.cat([consecutive, features[:, local:]], 1).flatten(0, 1)
@@ -203,7 +208,8 @@ class E2FGVI(nn.Module):
         size = [side // STRIDE_PX for side in frames.shape[-2:]]
         small = F.interpolate((frames.flatten(0, 1) + 1) / 2, size=size, mode="bilinear", align_corners=True)
         small = small.unflatten(0, frames.shape[:2])
-        first, second = small[:, :-1].flatten(0, 1), small[:, 1:].flatten(0, 1)
+        first = small[:, :-1].flatten(0, 1)
+        second = small[:, 1:].flatten(0, 1)
         if not len(first):
             none = small.new_zeros(len(frames), 0, 2, *small.shape[-2:])
             return LocalFlows(none, none)

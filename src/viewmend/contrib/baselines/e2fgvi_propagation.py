@@ -115,7 +115,8 @@ def deform_conv2d(
 
     Sampling is bilinear; zero outside of the image.
     """
-    kernel, (height, width) = weight.shape[-1], x.shape[-2:]
+    kernel = weight.shape[-1]
+    height, width = x.shape[-2:]
     points = kernel * kernel
     groups = masks.shape[1] // points
     # Positions of a hundred pixels need more digits than half precision has.
@@ -217,11 +218,14 @@ class Propagation(nn.Module):
         for number, seen in enumerate(known):
             result = torch.zeros_like(seen[0])
             if number:
-                last, flow = results[-1], flows[number - 1]
-                earlier, flow2 = torch.zeros_like(last), torch.zeros_like(flow)
+                last = results[-1]
+                flow = flows[number - 1]
+                earlier = torch.zeros_like(last)
+                flow2 = torch.zeros_like(flow)
                 warped2 = earlier
                 if number > 1:
-                    earlier, flow2 = results[-2], flow + warp(flows[number - 2], flow)
+                    earlier = results[-2]
+                    flow2 = flow + warp(flows[number - 2], flow)
                     warped2 = warp(earlier, flow2)
                 around = torch.cat([warp(last, flow), seen[0], warped2], 1)
                 result = self.deform_align[way](torch.cat([last, earlier], 1), around, flow, flow2)

@@ -78,7 +78,8 @@ def stitch(
     pieces: Sequence[Image], windows: Sequence[Window], canvas: tuple[int, int], overlap_px: int
 ) -> Float[Tensor, "3 canvasheight canvaswidth"]:
     """The windows' images in one; in overlaps, weights fall towards each window's edge. Elsewhere 0."""
-    total, weights = pieces[0].new_zeros(3, *canvas), pieces[0].new_zeros(canvas)
+    total = pieces[0].new_zeros(3, *canvas)
+    weights = pieces[0].new_zeros(canvas)
     size = (pieces[0].shape[1], pieces[0].shape[2])
     rows, cols = (_ramp(side, overlap_px).to(total) for side in size)
     weight = rows[:, None] * cols
@@ -97,7 +98,8 @@ def dilated(holes: Bool[Tensor, "height width"], by_px: int) -> Bool[Tensor, "he
     """Holes dilated by a 3 x 3 cross, this many times."""
     grown = holes[None].float()
     for _ in range(by_px):
-        up_down, left_right = max_pool2d(grown, (3, 1), 1, (1, 0)), max_pool2d(grown, (1, 3), 1, (0, 1))
+        up_down = max_pool2d(grown, (3, 1), 1, (1, 0))
+        left_right = max_pool2d(grown, (1, 3), 1, (0, 1))
         grown = torch.maximum(up_down, left_right)
     return grown[0] > 0
 
@@ -156,12 +158,14 @@ def camera_windows(
     height, width = size
     cameras = views.frame.cameras
     extent = cameras.size_px.to(images)
-    scale, centre = extent / extent.new_tensor([width, height]), extent / 2
+    scale = extent / extent.new_tensor([width, height])
+    centre = extent / 2
     if at is not None:
         uv, z = project(at.point, cameras)
         near = (cameras.K[:, 0, 0] / z[:, 0] * at.pixel_m)[:, None].expand(-1, 2)
         before = z > 0
-        scale, centre = torch.where(before, near, scale), torch.where(before, uv[:, 0], centre)
+        scale = torch.where(before, near, scale)
+        centre = torch.where(before, uv[:, 0], centre)
     offsets = pixel_centers(width, height, images.device) - extent.new_tensor([width / 2, height / 2])
     places = centre[:, None, None] + scale[:, None, None] * offsets
     shown = sample_bilinear(images, places.flatten(1, 2)).movedim(-1, 1).unflatten(2, size)

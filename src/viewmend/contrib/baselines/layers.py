@@ -12,10 +12,16 @@ SLOPE = 0.2
 """Slope of every LeakyReLU in encoder and decoder."""
 STRIDE_PX = 4
 """Pixels per feature cell."""
-SHALLOW, FEATURES = 256, 128
-"""Channels after the first four convolutions (input of all later ones, too) and at the end."""
-PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
-"""Patches are 7 x 7 feature cells, one every 3, with 3 cells of zeros around the map."""
+SHALLOW = 256
+"""Channels after the first four convolutions; they are also an input of all later ones."""
+FEATURES = 128
+"""Channels of a feature map."""
+PATCH_CELLS = 7
+"""Height and width of a patch in feature cells."""
+STEP_CELLS = 3
+"""Feature cells from patch to patch."""
+MARGIN_CELLS = 3
+"""Cells of zeros around the feature map."""
 STEP_PX = STRIDE_PX * STEP_CELLS
 """Pixels from token to token."""
 DIM = 512

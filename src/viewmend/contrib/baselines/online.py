@@ -130,7 +130,8 @@ class OnlineInpainter(Inpainter):
     """
 
     def __init__(self, network: OnlineNetwork, config: OnlineConfig | None = None) -> None:
-        self.network, self.config = network, config or OnlineConfig()
+        self.network = network
+        self.config = config or OnlineConfig()
         network.check_size(*self.config.size_px)
 
     def initial_state(self) -> OnlineState:
@@ -166,7 +167,8 @@ class OnlineInpainter(Inpainter):
 
     def _kept(self, state: OnlineState, time: int, canvas: Canvas) -> OnlineState:
         """The parts of the past and of this time that later views may use."""
-        frames, wanted = {time: canvas.image, **state.frames}, self.config.sampling.is_wanted_after
+        frames = {time: canvas.image, **state.frames}
+        wanted = self.config.sampling.is_wanted_after
         return replace(state, frames={past: frame for past, frame in frames.items() if wanted(past, time)})
 
     def _canvas(self, view: IncompleteView) -> Canvas:
@@ -203,11 +205,13 @@ class OnlineInpainter(Inpainter):
         cameras: Callable[[int], tuple[ContextViews, Tensor] | None],
     ) -> Clip:
         """A window at the view's time and at the past times that the sampling wants."""
-        size, sampling = self.config.size_px, self.config.sampling
+        size = self.config.size_px
+        sampling = self.config.sampling
 
         def look(time: int) -> Frames:
             own = window.of(frames[time], size)[None]
-            if (found := cameras(time)) is None:
+            found = cameras(time)
+            if found is None:
                 return own
             views, images = found
             return torch.cat([own, camera_windows(images, views, aim(view, window, size), size).to(own)])

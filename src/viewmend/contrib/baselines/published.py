@@ -41,7 +41,8 @@ def make_baseline(name: str, device: torch.device | str = "cpu") -> Inpainter:
         MissingWeightsError: its weights were not found.
         ValueError: no such name; or the weights are damaged or another network's (`WeightsError`).
     """
-    if found := _NAME.fullmatch(name):
+    found = _NAME.fullmatch(name)
+    if found:
         network = load_baseline(found["network"], found["weights"] or "", device)
         sampling = Sampling(grid="relative" if found["grid"] else "absolute")
         config = OnlineConfig(framing=found["framing"], sampling=sampling)  # pyright: ignore[reportArgumentType]

@@ -33,14 +33,16 @@ DISAGREEMENT = (0.01, 0.5)
 square pixels."""
 RAFT_CELL_PX = 8
 """Sides of RAFT's input are multiples of this."""
-RAFT_MIN_PX, RAFT_MAX_PX = 128, 864
-"""Sides of RAFT's input: the coarsest correlation needs 128 px; RGVI uses 480 x 864."""
+RAFT_MIN_PX = 128
+"""Shortest side of RAFT's input, which its coarsest correlation needs."""
+RAFT_MAX_PX = 864
+"""Longest side of RAFT's input; RGVI uses 480 x 864 pixels."""
 PAST_FRAMES = 10
 """Number of past frames that are kept."""
 FLOW_MARGIN_PX = 4
-"""Flow this near to a hole depends on the fill, and is completed, too."""
+"""Flow within this distance of a hole is completed too, since it depends on the fill; pixels."""
 Flow = Callable[[Image, Image], FlowMap]
-"""flow(image, other), of images in [0, 1]."""
+"""Estimates the flow from an image to another one, both in [0, 1]."""
 
 
 def dis_flow(image: Image, other: Image) -> FlowMap:

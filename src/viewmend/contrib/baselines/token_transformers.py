@@ -79,7 +79,8 @@ class TokenBlock(nn.Module):
         super().__init__()
         self.attention = MultiHeadAttention()
         self.ffn = ffn
-        self.norm1, self.norm2 = nn.LayerNorm(DIM), nn.LayerNorm(DIM)
+        self.norm1 = nn.LayerNorm(DIM)
+        self.norm2 = nn.LayerNorm(DIM)
 
 
 class TokenTransformer(nn.Module, ABC):

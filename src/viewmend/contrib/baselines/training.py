@@ -48,10 +48,11 @@ MAX_REFERENCES = 3
 CLIP_LENGTH = 5
 """Consecutive views in the authors' training clips."""
 FULL_RATE = 0.8
-"""Fraction of a run at the full learning rate; the rest is at a tenth of it, as in the authors' training."""
-ADVERSARIAL, DISCRIMINATOR_RATE = 0.01, 1e-4
-"""Weight of the hinge loss of T-PatchGAN, and the discriminator's learning rate, as in the
-authors' training."""
+"""Fraction of a run at the full learning rate, as in the authors' training; the rest is at a tenth of it."""
+ADVERSARIAL = 0.01
+"""Weight of the hinge loss of T-PatchGAN, as in the authors' training."""
+DISCRIMINATOR_RATE = 1e-4
+"""The discriminator's learning rate, as in the authors' training."""
 SAMPLING = SamplingConfig(
     frames=(0, *range(10, 10 + CLIP_LENGTH)), clip_length=CLIP_LENGTH, num_target_frames=3, with_context=True
 )
@@ -188,13 +189,15 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
         """A view as a stream of one frame."""
         assert isinstance(model, TokenTransformer | E2FGVI)
         inpainter = OnlineInpainter(model, OnlineConfig(framing="def", size_px=self.options.size_px))
-        nothing, background = ContextProvider(lambda *_: None), self.options.background
+        nothing = ContextProvider(lambda *_: None)
+        background = self.options.background
         made, _ = inpainter.step_on(background, sample.view, nothing, inpainter.initial_state())
         return composite(background, made.rgb, made.opacity)
 
     def _complete(self, clip: TrainingClip) -> tuple[Float[Tensor, "time 3 height width"], Float[Tensor, ""]]:
         """The network's views of a clip, and the term of its flows, 0 without a teacher."""
-        frames, count = torch.cat([clip.frames, clip.references])[None], len(clip.frames)
+        frames = torch.cat([clip.frames, clip.references])[None]
+        count = len(clip.frames)
         with torch.autocast(frames.device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             if not isinstance(self.model, E2FGVI):
                 return self.model(frames)[0, :count].float(), frames.new_zeros(())
@@ -260,7 +263,8 @@ def clip_terms(
     made: Float[Tensor, "time 3 height width"], clip: TrainingClip
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """L1 in the holes over their number of pixels, and the same outside of them; 0 if there are none."""
-    difference, holes = (made - clip.truth).abs().mean(1), clip.holes.float()
+    difference = (made - clip.truth).abs().mean(1)
+    holes = clip.holes.float()
     inside, outside = ((difference * part).sum() / part.sum().clamp_min(1) for part in (holes, 1 - holes))
     return inside, outside
 

@@ -71,7 +71,8 @@ class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
             raise ValueError(f"cameras: expected different names, got {twice} more than once; rename one")
 
 
@@ -143,7 +144,8 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     folder = path.resolve().parent
     calibration = _calibration(folder / rig.calibration, rig.format)
     known = {camera.name: camera for camera in calibration.cameras}
-    if unknown := [camera.name for camera in rig.cameras if camera.name not in known]:
+    unknown = [camera.name for camera in rig.cameras if camera.name not in known]
+    if unknown:
         expected = f"expected cameras that {calibration.file} has ({', '.join(known)})"
         raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
     return LiveRig(

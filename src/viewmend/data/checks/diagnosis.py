@@ -229,7 +229,8 @@ def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float
     frame = limit_size(frame, PAIRS_PX)
     for first, second in itertools.combinations(range(len(names)), 2):
         order = list(range(len(names)))
-        order[first], order[second] = second, first
+        order[first] = second
+        order[second] = first
         if frame.cameras.size_px[first].tolist() != frame.cameras.size_px[second].tolist():
             continue
         cameras = replace(frame.cameras[order], names=names)

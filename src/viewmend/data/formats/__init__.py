@@ -68,13 +68,15 @@ FORMAT_NAMES = ("plain", *FORMATS)
 def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
     """The format, and the file that identifies it; of `names`, the first one that matches."""
     for name in names:
-        if (file := FORMATS[name].find(path)) is not None:
+        file = FORMATS[name].find(path)
+        if file is not None:
             return name, file
     if path.is_dir():
         parents = path.resolve().parents[:2]
         for place in (place for parent in parents for place in folders_containing(parent, "calib")[1:]):
             for name in (name for name in SESSIONS if name in names):
-                if (file := FORMATS[name].find(place)) is not None:
+                file = FORMATS[name].find(place)
+                if file is not None:
                     return name, file
     return "", None
 
@@ -122,7 +124,8 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
                 return _as_stored(replace(calibration, folder=FORMATS[name].root(path, file)))
         except (ValueError, OSError) as error:
             raise CaptureError(f"{file}: {error}") from None
-    if inner := [place for place in folders_containing(path, "")[1:] if _is_capture(place, names, native)]:
+    inner = [place for place in folders_containing(path, "")[1:] if _is_capture(place, names, native)]
+    if inner:
         got = f"a folder of captures ({', '.join(place.name for place in inner)[:200]})"
         raise CaptureError(f"{path}: expected a capture, got {got}; open one, such as {inner[0]}")
     if native:

@@ -66,7 +66,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         mask = find_mask(folder, image.removeprefix("images/"))
         lens = _lens(label, sensors.get(camera.get("sensor_id")))
         posed.append(PosedImage(image, mask, lens, R, center))
-    if (rig := fixed_cameras(posed)) is not None:
+    rig = fixed_cameras(posed)
+    if rig is not None:
         cameras, frames = rig
         return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
     entries = []

@@ -112,10 +112,12 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         images.append(
             PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t)
         )
-    if (rig := fixed_cameras(images)) is not None:
+    rig = fixed_cameras(images)
+    if rig is not None:
         cameras, frames = rig
         return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
-    if (moments := _count_moments(file)) > 1:
+    moments = _count_moments(file)
+    if moments > 1:
         got = (
             f"{moments} frames of a rig, {file.with_stem('frames').name}, in which cameras have several poses"
         )

@@ -78,7 +78,8 @@ def _image_files(folder: Path) -> list[Path]:
     """The files with images in the folder, or else in its subfolders `*main*`."""
     for places in ([folder], folders_containing(folder, "main")[1:]):
         files = [file for place in places for file in files_like(place, f"*{SUFFIX}")]
-        if found := [file for file in files if not file.name.endswith(ANNOTATIONS)]:
+        found = [file for file in files if not file.name.endswith(ANNOTATIONS)]
+        if found:
             return found
     return []
 

@@ -133,7 +133,8 @@ def warn_of_unused_images(folder: Path, used: Iterable[str]) -> None:
         return
     found = (path.relative_to(folder) for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     images = {path.as_posix() for path in found if not any(_is_hidden(part) for part in path.parts)}
-    if unused := sorted(images - set(used)):
+    unused = sorted(images - set(used))
+    if unused:
         warn(f"{folder}: images that the calibration does not mention are ignored: {listed(unused)}")
 
 
@@ -260,7 +261,8 @@ def _found_footage(folder: Path, names: Sequence[str], paths: Sequence[str]) -> 
     match = _match_some(names, paths)
     if match.several:
         raise ValueError(_several_videos(match.several))
-    if absent := [name for name in names if name not in match.paths]:
+    absent = [name for name in names if name not in match.paths]
+    if absent:
         warn(f"{folder}: cameras without footage are left out: {listed(absent)}")
     used = set(match.paths.values())
     unused = [path for path in paths if path not in used and "/" in path and not _without_subject(path)]
@@ -340,7 +342,8 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     paths = {name: shown[name][0] if len(shown[name]) == 1 else path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
-        if (video := videos.get(name)) is not None:
+        video = videos.get(name)
+        if video is not None:
             entries[name] = {"width": video.width, "height": video.height, "video": path}
         elif (images := list_images(folder, path)) is None:
             raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
@@ -526,7 +529,8 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str,
     )
     if match.several:
         raise ValueError(f"{place}: {_several_videos(match.several)}")
-    if absent := [name for name in names if name not in match.paths]:
+    absent = [name for name in names if name not in match.paths]
+    if absent:
         expected = f"masks of each camera in {place}"
         raise ValueError(f"expected {expected}, got none of {listed(absent)}; name them after the cameras")
     labels = {"mask_labels": True} if place in LABELS else {}

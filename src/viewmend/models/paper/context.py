@@ -94,7 +94,10 @@ def collate(
 
     `own_keys_values` are K and V of each target's complete patches.
     """
-    queries, query_positions, keys, key_positions = [], [], [], []
+    queries = []
+    query_positions = []
+    keys = []
+    key_positions = []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
         uvs = F.pad(
             centers_px(target.places) / target.view.camera.size_px[0], (0, 1)
@@ -122,7 +125,8 @@ def _carry(
     frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig
 ) -> Positions:
     """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
-    points, valid = frame.points_world, frame.valid
+    points = frame.points_world
+    valid = frame.valid
     if frame.time != view.time:
         current = [f for f in frames if f.camera.names == frame.camera.names and f.time == view.time]
         if current:

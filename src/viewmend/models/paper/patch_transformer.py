@@ -126,7 +126,8 @@ class PatchTransformer(Network):
         """The views' contexts, with all camera images of their windows (section 2) encoded in one batch."""
         windows = []
         for view, context in zip(views, contexts, strict=True):
-            names, times = self.source_names(view), window_times(view.time, self.config)
+            names = self.source_names(view)
+            times = window_times(view.time, self.config)
             kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
             kept = [
                 c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names)
@@ -199,11 +200,13 @@ def _split_by_camera(
     keys_values: Float[Tensor, "block 2 patch dim"],
 ) -> tuple[ContextFrame, ...]:
     """The encoded patches of one frame, lifted (section 5) and split by camera."""
-    cameras, places = views.frame.cameras, images.places
+    cameras = views.frame.cameras
+    places = images.places
     depths = patch_depths(views.depth, images.foreground)
     points, valid = lift(places, depths, cameras)
     uv_px = centers_px(places)
-    frames, first = [], 0
+    frames = []
+    first = 0
     for i, count in enumerate(images.kept.sum((1, 2)).tolist()):
         own = slice(first, first + count)
         frames.append(

@@ -97,8 +97,10 @@ def crop(
     rows = slice(max(top, 0), max(min(top + size[0], height), 0))
     cols = slice(max(left, 0), max(min(left + size[1], width), 0))
     inside = image[:, rows, cols]
-    above, before = min(max(-top, 0), size[0]), min(max(-left, 0), size[1])
-    below, after = size[0] - above - inside.shape[1], size[1] - before - inside.shape[2]
+    above = min(max(-top, 0), size[0])
+    before = min(max(-left, 0), size[1])
+    below = size[0] - above - inside.shape[1]
+    after = size[1] - before - inside.shape[2]
     return F.pad(inside, (before, after, above, below))
 
 

@@ -76,7 +76,9 @@ def build_target_input(view: IncompleteView, config: PaperConfig) -> EncoderInpu
     if not config.use_mask:  # F as it was rendered, and every patch
         everywhere = torch.ones_like(view.mask[None])
         return _stack_channels(view.rgb[None], everywhere, view.depth[None], everywhere > 0, config)
-    rgb, mask, missing = view.cut_rgb[None], view.silhouette[None], view.missing
+    rgb = view.cut_rgb[None]
+    mask = view.silhouette[None]
+    missing = view.missing
     if config.background == "white":
         rgb = (rgb + (1 - mask)) * (1 - missing)
     foreground = (mask > 0) | (missing[None] > 0)
@@ -118,7 +120,8 @@ class Encoder(nn.Module):
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
-        widths, early = config.widths, config.widths[3]
+        widths = config.widths
+        early = config.widths[3]
         inputs = (config.in_channels, *widths[:4], *(early + w for w in widths[4:8]))
         strides = (2, 1, 2, 1, 1, 1, 1, 1, 1)
         self.layers = nn.ModuleList(
@@ -184,7 +187,8 @@ class Tokeniser(nn.Module):
         """Features of the kept patches of these images, in one batch."""
         crops = [find_crop(kept) for _, kept in images]
         size = (max(s[0] for _, s in crops), max(s[1] for _, s in crops))
-        windows, places = [], []
+        windows = []
+        places = []
         for number, ((image, kept), ((row, col), _)) in enumerate(zip(images, crops, strict=True)):
             windows.append(crop(image, row * STEP_PX, col * STEP_PX, size))
             places.append(F.pad(torch.nonzero(kept) - torch.tensor([row, col]), (1, 0), value=number))

@@ -86,7 +86,8 @@ def attend_and_sum(
     step = max(1, CHUNK_ENTRIES // (samples * heads * K.shape[2]))
     any_kept = keep.any(1)[:, None, None, None]
     mask = torch.where(keep[:, None, None] | ~any_kept, 0.0, -torch.inf).to(Q.dtype)
-    outs, received = [], Q.new_zeros(K.shape[0], K.shape[2], dtype=torch.float32)
+    outs = []
+    received = Q.new_zeros(K.shape[0], K.shape[2], dtype=torch.float32)
     for start in range(0, queries, step):
         scores = (Q[:, :, start : start + step] @ K.mT) * scale + mask
         weights = scores.float().softmax(-1) * any_kept
@@ -139,7 +140,8 @@ class Block(nn.Module):
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
-        dim, hidden = config.dim, config.ffn_ratio * config.dim
+        dim = config.dim
+        hidden = config.ffn_ratio * config.dim
         self.norm_query = nn.LayerNorm(dim)
         self.query = nn.Linear(dim, dim)
         self.norm_ffn = nn.LayerNorm(dim)
@@ -225,17 +227,21 @@ class Transformer(nn.Module):
         self, index: int, tokens: Tokens, context: Context, kept: Int[Tensor, "sample kept"] | None = None
     ) -> tuple[Queries, Keys, Keys, Bool[Tensor, "sample key"]]:
         """RoPE(Q), RoPE(K) and V of a block, and which keys count; of the kept keys alone, if given."""
-        block, heads = self.blocks[index], self.config.heads
+        block = self.blocks[index]
+        heads = self.config.heads
         assert isinstance(block, Block)
         Q = rearrange(block.query(block.norm_query(tokens)), "b n (h c) -> b h n c", h=heads)
         KV = rearrange(context.keys_values[index], "two b n (h c) -> two b h n c", h=heads)
-        present, rotation = context.present, context.key_rotation
+        present = context.present
+        rotation = context.key_rotation
         if kept is not None:
-            present, pick = present.gather(1, kept), kept[:, None, :, None]
+            present = present.gather(1, kept)
+            pick = kept[:, None, :, None]
             KV = KV.gather(3, pick.expand(2, -1, heads, -1, KV.shape[4]))
             if rotation is not None:
                 rotation = rotation.gather(3, pick.expand(2, -1, -1, -1, rotation.shape[4]))
         K, V = KV
         if rotation is not None and context.query_rotation is not None:
-            Q, K = rotate(Q, context.query_rotation), rotate(K, rotation)
+            Q = rotate(Q, context.query_rotation)
+            K = rotate(K, rotation)
         return Q, K, V, present

@@ -145,7 +145,8 @@ def _vector(pose: Pose) -> Float64[np.ndarray, "6"]:
 
 def _matrix(vector: Float64[np.ndarray, "6"]) -> Pose:
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
+    pose[:3, :3] = cv2.Rodrigues(vector[:3])[0]
+    pose[:3, 3] = vector[3:]
     return pose
 
 

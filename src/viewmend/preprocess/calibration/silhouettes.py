@@ -167,7 +167,8 @@ class _Problem:
             while damping < MOST_DAMPING:
                 moved = x + np.linalg.solve(H + damping * np.diag(np.diag(H)), -g).reshape(x.shape)
                 tried = self.refined(moved, depths)
-                if (new := self.cost(moved, tried)) < cost:
+                new = self.cost(moved, tried)
+                if new < cost:
                     break
                 damping *= 10
             else:

@@ -83,7 +83,8 @@ class PersonMasks:
         alpha = np.zeros(rgb.shape[:2], np.float32)
         self._tracked = []
         for roi in candidates[:MAX_PEOPLE]:
-            if (found := _segment(rgb, roi)) is None:
+            found = _segment(rgb, roi)
+            if found is None:
                 continue
             own, following = found
             alpha = np.maximum(alpha, own)
@@ -118,7 +119,8 @@ def _detect(rgb: Rgb, small_people: bool = False) -> list[Roi]:
     too: people of less than a quarter of the longer side are too small for it.
     """
     height, width = rgb.shape[:2]
-    if (found := _detect_in(rgb, 0, 0, max(height, width))) or not small_people:
+    found = _detect_in(rgb, 0, 0, max(height, width))
+    if found or not small_people:
         return found
     for side in (min(height, width), min(height, width) // 2):
         corners = itertools.product(_steps(height, side), _steps(width, side))

@@ -156,7 +156,8 @@ def _paths(names: Sequence[str], place: str) -> list[Path]:
     found = (
         {path.stem: path for path in sorted(folder.iterdir()) if path.is_file()} if folder.is_dir() else {}
     )
-    if (chosen := match_names(names, found)) is None:
+    chosen = match_names(names, found)
+    if chosen is None:
         raise CaptureError(
             f"{place}: expected a folder with one image or video named after each camera ({', '.join(names)[:80]}), "
             f"or a path with {CAMERA} in it, got neither; rename the files"

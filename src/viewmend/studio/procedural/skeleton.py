@@ -60,7 +60,10 @@ def rotation(axis: int, angle_rad: float) -> Rotation:
     R = np.eye(3)
     i = (axis + 1) % 3
     j = (axis + 2) % 3
-    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
+    R[i, i] = c
+    R[i, j] = -s
+    R[j, i] = s
+    R[j, j] = c
     return R
 
 
