@@ -17,17 +17,11 @@ from viewmend.data.native_format import read_calibration
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureSubset
 from viewmend.geometry.cameras import project
-from viewmend.preprocess.calibration import silhouettes as held_out
+from viewmend.preprocess.calibration import cross_validation
 from viewmend.preprocess.calibration.board import Corners, parse_board
 from viewmend.preprocess.calibration.bundle import calibrate
-from viewmend.preprocess.calibration.silhouettes import (
-    HOLDS,
-    HeldOutIou,
-    Refinement,
-    best_hold,
-    brought_to,
-    missed_px,
-)
+from viewmend.preprocess.calibration.cross_validation import HeldOutIou, best_hold, held_out_residual_px
+from viewmend.preprocess.calibration.silhouettes import HOLDS, Refinement, align_rig
 from viewmend.studio.rigs import ring_rig
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -57,7 +51,7 @@ def over_the_stage_px(found, cameras):
     points = torch.from_numpy(
         np.random.default_rng(1).uniform([-0.7, 0, -0.7], [0.7, 1.9, 0.7], (1000, 3))
     ).float()
-    seen = project(points, brought_to(found, cameras, points))[0]
+    seen = project(points, align_rig(found, cameras, points))[0]
     return (seen - project(points, cameras)[0]).norm(dim=-1).mean(1)
 
 
@@ -165,7 +159,7 @@ def test_silhouettes_refine_a_disturbed_rig(studio, tmp_path):
     folder = shutil.copytree(studio[0], tmp_path / "take")
     disturbed(folder)
     capture = open_capture(folder)
-    refined = held_out.refined_all([capture.read(0), capture.read(1)], capture.bounds, HOLDS[0])
+    refined = cross_validation.refine_all([capture.read(0), capture.read(1)], capture.bounds, HOLDS[0])
     before, after = (over_the_stage_px(c, studio[1]).mean() for c in (capture.cameras, refined.cameras))
     assert after < 0.5 * before and refined.after_px < 0.3 * refined.before_px
     moved_m = (refined.cameras.centers - capture.cameras.centers).norm(dim=1).mean()
@@ -186,8 +180,8 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
     folder, cameras = shutil.copytree(studio[0], tmp_path / "take"), studio[1]
     disturbed(folder)
     true = lambda frames, *_: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1)  # noqa: E731
-    monkeypatch.setattr(held_out, "refine_by_silhouettes", true)
-    monkeypatch.setattr(held_out, "best_hold", lambda *_: HOLDS[0])
+    monkeypatch.setattr(cross_validation, "refine_by_silhouettes", true)
+    monkeypatch.setattr(cross_validation, "best_hold", lambda *_: HOLDS[0])
     assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "outlines  missed_px 0.9, refined_px 0.1" in lines and len(lines) == 4
@@ -200,9 +194,9 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
 
 def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        held_out, "refine_by_silhouettes", lambda frames, *_: Refinement(frames[0].cameras, 0.1, 0.1)
+        cross_validation, "refine_by_silhouettes", lambda frames, *_: Refinement(frames[0].cameras, 0.1, 0.1)
     )
-    monkeypatch.setattr(held_out, "best_hold", lambda *_: HOLDS[0])
+    monkeypatch.setattr(cross_validation, "best_hold", lambda *_: HOLDS[0])
     arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]
     assert main(arguments) == 2
     assert "keep the calibration" in capsys.readouterr().err and not (tmp_path / "out").exists()
@@ -232,7 +226,7 @@ def test_of_several_times_those_left_out_choose(frames, best, monkeypatch):
         asked.append((left, hold))
         return 0.1 if hold == best else 0.2
 
-    monkeypatch.setattr(held_out, "missed_px", missed)
+    monkeypatch.setattr(cross_validation, "held_out_residual_px", missed)
     assert best_hold(frames, None) == best
     assert sorted(asked) == sorted((time, hold) for time in (0, 1) for hold in HOLDS)
 
@@ -240,7 +234,7 @@ def test_of_several_times_those_left_out_choose(frames, best, monkeypatch):
 @pytest.mark.parametrize("best", HOLDS)
 def test_of_a_single_time_cameras_choose(frames, best, monkeypatch):
     judged = lambda frames, name, bounds, hold: HeldOutIou(name, 0.9, 0.95 if hold == best else 0.94)  # noqa: E731
-    monkeypatch.setattr(held_out, "refined_without", judged)
+    monkeypatch.setattr(cross_validation, "validate_without", judged)
     assert best_hold(frames[:1], None) == best
 
 
@@ -251,8 +245,8 @@ def test_the_time_that_is_left_out_is_not_refined_by(frames, monkeypatch):
         seen.extend(frame.time for frame in frames)
         return Refinement(frames[0].cameras, 0.0, 0.0)
 
-    monkeypatch.setattr(held_out, "refined_all", refined)
-    exact = missed_px(frames[:2], 1, None, HOLDS[0])
+    monkeypatch.setattr(cross_validation, "refine_all", refined)
+    exact = held_out_residual_px(frames[:2], 1, None, HOLDS[0])
     assert seen == [0] and exact < 0.3
 
     def disturbed(frames, bounds, hold):
@@ -260,5 +254,5 @@ def test_the_time_that_is_left_out_is_not_refined_by(frames, monkeypatch):
         pose[1, 1, 3] += 0.1
         return Refinement(replace(frames[0].cameras, camera_from_world=pose), 0.0, 0.0)
 
-    monkeypatch.setattr(held_out, "refined_all", disturbed)
-    assert missed_px(frames[:2], 1, None, HOLDS[0]) > exact + 0.3 and np.isfinite(exact)
+    monkeypatch.setattr(cross_validation, "refine_all", disturbed)
+    assert held_out_residual_px(frames[:2], 1, None, HOLDS[0]) > exact + 0.3 and np.isfinite(exact)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from reference.filmed_board import photograph
 
-from viewmend.preprocess.calibration.board import parse_board, refined
+from viewmend.preprocess.calibration.board import parse_board, refine_corners
 
 BOARD = parse_board("8x6:0.12:0.09", "DICT_5X5_1000")
 K = np.array([[620.0, 0, 256], [0, 615, 306], [0, 0, 1]])
@@ -26,7 +26,7 @@ def pictured(tilt_deg, lens=STRAIGHT, noise=2.0, blur_px=0.0, board=BOARD):
 
 
 def moved(image, start):
-    return refined(image, start, BOARD.corners_m[:, :2], BOARD.square_m, BOARD.marker_m)
+    return refine_corners(image, start, BOARD.corners_m[:, :2], BOARD.square_m, BOARD.marker_m)
 
 
 @pytest.mark.parametrize("lens", [STRAIGHT, BENT], ids=["straight", "bent"])

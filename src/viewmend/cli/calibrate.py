@@ -75,14 +75,14 @@ def _by_board(options: Options, out: Path) -> Figures:
     from viewmend.cli.console import busy, track
     from viewmend.data.images import write_image
     from viewmend.data.native_format import write_calibration
-    from viewmend.preprocess.calibration.board import look_for, open_footage, parse_board
-    from viewmend.preprocess.calibration.bundle import calibrate, residual_picture
+    from viewmend.preprocess.calibration.board import find_board, open_footage, parse_board
+    from viewmend.preprocess.calibration.bundle import calibrate, draw_residuals
 
     assert options.board is not None
     board = parse_board(options.board, options.dictionary)
     footage = open_footage(options.source)
     times = chosen_times(options.frames, len(footage.frames))[:: options.every]
-    seen = look_for(board, footage, times, lambda cameras: track(cameras, "looking for the board"))
+    seen = find_board(board, footage, times, lambda cameras: track(cameras, "looking for the board"))
     sizes = [(camera.width, camera.height) for camera in footage.cameras]
     with busy("adjusting all cameras"):
         found = calibrate(seen, board, [camera.name for camera in footage.cameras], sizes)
@@ -95,7 +95,7 @@ def _by_board(options: Options, out: Path) -> Figures:
     up = -sum(camera.R[1] for camera in cameras)
     out.mkdir()
     write_calibration(out, replace(footage, cameras=cameras, up=up))
-    write_image(out / "residuals.png", residual_picture(cameras, found))
+    write_image(out / "residuals.png", draw_residuals(cameras, found))
     images = [sum(view == number for view, _ in seen) for number in range(len(cameras))]
     return {
         camera.name: {"images": count, "corners": len(one.corners), "rms_px": one.rms_px}
@@ -108,14 +108,20 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
     from viewmend.data.formats import read_any_calibration
     from viewmend.data.native_format import write_calibration
     from viewmend.preprocess.calibration.bundle import with_cameras
-    from viewmend.preprocess.calibration.silhouettes import best_hold, left_out, refined_all, refined_without
+    from viewmend.preprocess.calibration.cross_validation import (
+        best_hold,
+        cameras_to_hold_out,
+        refine_all,
+        validate_without,
+    )
 
     frames, bounds = _frames(options)
     names = frames[0].cameras.names
     with busy("choosing how far cameras may move"):
         hold = best_hold(frames, bounds)
     scores = [
-        refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")
+        validate_without(frames, name, bounds, hold)
+        for name in track(cameras_to_hold_out(names), "cameras left out")
     ]
     for score in scores:
         say(
@@ -132,7 +138,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
             "better masks"
         )
     with busy("refining all cameras"):
-        refined = refined_all(frames, bounds, hold)
+        refined = refine_all(frames, bounds, hold)
     out.mkdir()
     path = options.source.parent if options.source.is_file() else options.source
     write_calibration(out, with_cameras(read_any_calibration(path, options.format), refined.cameras))
@@ -144,7 +150,7 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     """Frames with a subject, all with the same cameras, as many as possible; and the capture's bounds."""
     from viewmend.cli.checks import chosen_times
     from viewmend.data.prepare import open_masked, prepare
-    from viewmend.preprocess.calibration.silhouettes import LEAST_CAMERAS
+    from viewmend.preprocess.calibration.silhouettes import MIN_CAMERAS
 
     capture = open_masked(options.source, format=options.format)
     times = chosen_times(options.frames, len(capture.frame_ids))
@@ -156,8 +162,8 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
         raise ValueError(f"expected a subject in one of {count} frames, got none; choose other --frames")
     most = max((frame.cameras.names for frame in read), key=len)
     frames = [frame for frame in read if frame.cameras.names == most]
-    if len(most) < LEAST_CAMERAS + 1:
+    if len(most) < MIN_CAMERAS + 1:
         raise ValueError(
-            f"expected {LEAST_CAMERAS + 1} cameras or more with masks, got {len(most)}; use more, or --board"
+            f"expected {MIN_CAMERAS + 1} cameras or more with masks, got {len(most)}; use more, or --board"
         )
     return frames, capture.bounds

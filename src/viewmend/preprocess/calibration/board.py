@@ -1,4 +1,4 @@
-"""A ChArUco board, and its corners in images."""
+"""Finds the corners of a ChArUco board in images."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -18,66 +18,69 @@ from viewmend.data.formats.files import collect_footage, list_images
 from viewmend.data.native_format import FILE_KINDS, NativeCalibration, NativeCamera
 from viewmend.data.videos import is_video
 
-ALONG = 0.42
-"""Part of each edge that is used, as a share of a square's side."""
-CLEAR_PX = 0.8
-"""Pixels closer to a marker than this, pixels, are not used."""
-LEAST_CLEAR = 0.35
+EDGE_FRACTION = 0.42
+"""Length of the part of each edge that is used, as a fraction of a square's side."""
+MARKER_MARGIN_PX = 0.8
+"""Pixels within this distance of a marker are not used; pixels."""
+MIN_GAP_FRACTION = 0.35
 """The smallest fraction of the gap between corner and marker that is used."""
 BLUR_PX = 0.5
-"""The search begins with edges this soft: the scale of the hyperbolic tangent, pixels."""
+"""Initial width of an edge: the scale of its hyperbolic tangent, pixels."""
 BLURS_PX = (0.3, 2.0)
-"""Edges are at least and at most this soft, pixels."""
+"""Smallest and largest width of an edge, pixels."""
 STEPS = 6
-"""A corner is refined in at most this many steps."""
-LEAST_PIXELS = 12
-"""A corner is refined if at least this many pixels show its edges."""
-MOST_STEP_PX = 0.5
-"""A step moves a corner by at most this many pixels."""
-MOST_MOVE_PX = 2.5
-"""A corner that would end more than this many pixels from where it was found stays there."""
+"""Largest number of steps that refine a corner."""
+MIN_PIXELS = 12
+"""Smallest number of pixels of its edges from which a corner is refined."""
+MAX_STEP_PX = 0.5
+"""Largest move of a corner in one step, pixels."""
+MAX_MOVE_PX = 2.5
+"""Largest move of a corner in all, pixels; one that would move further stays where it was
+detected."""
 OUTLIER_PX = 1.5
-"""Corners farther from the plane of the others are ignored."""
+"""Corners farther than this many pixels from the homography of the others are ignored."""
 
 
 Grey = UInt8[np.ndarray, "height width"]
 Points = Float64[np.ndarray, "point 2"]
-LEAST_CORNERS = 8
-"""Images with fewer corners are ignored."""
+MIN_CORNERS = 8
+"""Images with fewer corners than this are ignored."""
 
 
-def refined(grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float) -> Points:
-    """Move a board's corners to where its edges cross, in pixels; corners with too few edge pixels stay where they are.
+def refine_corners(
+    grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float
+) -> Points:
+    """Refine corners of a board to where its edges cross; those with too few edge pixels are unchanged.
 
-    They were found at `pixels`, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5).
-    On the board, along its edges, they are at `on_board_m`. `square_m` is a square's side,
-    `marker_m` that of a marker in its middle.
+    Positions are in pixels; the top-left pixel has its centre at (0.5, 0.5). `pixels` are accurate
+    to a pixel or two. `on_board_m` are the corners' positions on the board, along its edges.
+    `square_m` is a square's side, `marker_m` that of a marker in its middle.
     """
     found = cv2.findHomography(on_board_m, pixels - 0.5, cv2.RANSAC, OUTLIER_PX)[0]
     if found is None:
         return pixels
     clear_m = (square_m - marker_m) / 2
-    moved = [_crossing(grey, np.asarray(found), one, square_m, clear_m) for one in pixels - 0.5]
+    moved = [_refine_corner(grey, np.asarray(found), one, square_m, clear_m) for one in pixels - 0.5]
     return np.array(moved).reshape(-1, 2) + 0.5
 
 
-def _crossing(
+def _refine_corner(
     grey: Grey,
     image_from_board: Float64[np.ndarray, "3 3"],
     start_px: Float64[np.ndarray, "2"],
     square_m: float,
     clear_m: float,
 ) -> Float64[np.ndarray, "2"]:
-    """Where two edges cross, from where that was found; the top-left pixel is (0, 0)."""
+    """Refine the crossing of two edges near `start_px`; the top-left pixel is (0, 0)."""
     board_from_image = np.linalg.inv(image_from_board)
-    start_m = _mapped(board_from_image, start_px[None])[0]
+    start_m = _apply_homography(board_from_image, start_px[None])[0]
     x, y, w = image_from_board @ [*start_m, 1.0]
     # The homography's derivative: pixels per metre.
     per_m = (image_from_board[:2, :2] - np.outer([x / w, y / w], image_from_board[2, :2])) / w
     if not np.isfinite(per_m).all() or abs(np.linalg.det(per_m)) < 1e-9:
         return start_px
     per_px = np.linalg.norm(np.linalg.inv(per_m), axis=1)  # metres along x and y of the board, of one pixel
-    reach = np.abs(per_m).sum(1) * ALONG * square_m
+    reach = np.abs(per_m).sum(1) * EDGE_FRACTION * square_m
     low = np.maximum(np.ceil(start_px - reach), 0).astype(int)
     high = np.minimum(np.floor(start_px + reach) + 1, [grey.shape[1], grey.shape[0]]).astype(int)
     if (high - low < 3).any():
@@ -85,19 +88,19 @@ def _crossing(
     pixels = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), -1).reshape(
         -1, 2
     )
-    away_m = _mapped(board_from_image, pixels.astype(np.float64)) - start_m
-    clear = np.maximum(clear_m - CLEAR_PX * per_px, LEAST_CLEAR * clear_m)
-    used = (np.abs(away_m) < clear).any(1) & (np.abs(away_m) < ALONG * square_m).all(1)
-    if used.sum() < LEAST_PIXELS:
+    away_m = _apply_homography(board_from_image, pixels.astype(np.float64)) - start_m
+    clear = np.maximum(clear_m - MARKER_MARGIN_PX * per_px, MIN_GAP_FRACTION * clear_m)
+    used = (np.abs(away_m) < clear).any(1) & (np.abs(away_m) < EDGE_FRACTION * square_m).all(1)
+    if used.sum() < MIN_PIXELS:
         return start_px
-    moved_px = _fitted(away_m[used] / per_px, grey[pixels[used, 1], pixels[used, 0]].astype(np.float64))
-    if not (np.abs(moved_px) < MOST_MOVE_PX).all():
+    moved_px = _fit_crossing(away_m[used] / per_px, grey[pixels[used, 1], pixels[used, 0]].astype(np.float64))
+    if not (np.abs(moved_px) < MAX_MOVE_PX).all():
         return start_px
-    return _mapped(image_from_board, (start_m + moved_px * per_px)[None])[0]
+    return _apply_homography(image_from_board, (start_m + moved_px * per_px)[None])[0]
 
 
-def _fitted(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndarray, "2"]:
-    """Where the edges x = x0 and y = y0 cross: Gauss and Newton's steps for place, softness, darkness and contrast.
+def _fit_crossing(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndarray, "2"]:
+    """Fit the crossing of the edges x = x0 and y = y0, their width, brightness and contrast (Gauss-Newton).
 
     The picture is a + b tanh((x - x0) / s) tanh((y - y0) / s), with all lengths in pixels.
     """
@@ -113,12 +116,12 @@ def _fitted(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndar
         a, b = np.linalg.lstsq(level, values, rcond=None)[0]
         columns = [*level.T, -b * dx, -b * dy, -b * (dx * x + dy * y)]
         step = np.linalg.lstsq(np.stack(columns, 1), values - a - b * fx * fy, rcond=None)[0]
-        cross = cross + step[2:4].clip(-MOST_STEP_PX, MOST_STEP_PX)
+        cross = cross + step[2:4].clip(-MAX_STEP_PX, MAX_STEP_PX)
         blur = float(np.clip(blur + np.clip(step[4], -blur / 3, blur / 3), *BLURS_PX))
     return cross
 
 
-def _mapped(matrix: Float64[np.ndarray, "3 3"], points: Points) -> Points:
+def _apply_homography(matrix: Float64[np.ndarray, "3 3"], points: Points) -> Points:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
@@ -128,9 +131,9 @@ class Corners:
     """Corners of a board in one image."""
 
     ids: Int[np.ndarray, "corner"]
-    """Which of `Board.corners_m`."""
+    """Indices into `Board.corners_m`."""
     pixels: Float64[np.ndarray, "corner 2"]
-    """Where they are; the top-left pixel has its centre at (0.5, 0.5)."""
+    """Positions in the image, pixels; the top-left pixel has its centre at (0.5, 0.5)."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,7 @@ class Board:
     square_m: float
     marker_m: float
     dictionary: str
-    """Which of OpenCV's dictionaries the markers are of."""
+    """Name of the OpenCV dictionary of the markers."""
 
     @cached_property
     def corners_m(self) -> Float64[np.ndarray, "corner 3"]:
@@ -151,7 +154,7 @@ class Board:
 
     @cached_property
     def opencv(self) -> Any:
-        """The board as OpenCV has it; its `generateImage` is what is printed."""
+        """The board as an OpenCV object; its `generateImage` draws the board for printing."""
         return cv2.aruco.CharucoBoard(*self._layout)
 
     @cached_property
@@ -161,29 +164,29 @@ class Board:
 
     @cached_property
     def _detectors(self) -> tuple[Any, Any]:
-        """Detectors of today's pattern, and of that of OpenCV before 4.6 and calib.io, which differs for even rows."""
+        """Detectors of OpenCV's pattern, and of the one before 4.6, which differs for even rows."""
         old = cv2.aruco.CharucoBoard(*self._layout)
         old.setLegacyPattern(True)
         return cv2.aruco.CharucoDetector(self.opencv), cv2.aruco.CharucoDetector(old)
 
     def find(self, grey: Grey) -> Corners | None:
-        """The corners that an image shows, in either pattern; None where they are too few, or all in a line."""
+        """Find the corners in an image, in either pattern; None if they are too few or on one line."""
         new, old = self._detectors
         pixels, ids, markers, marker_ids = new.detectBoard(grey)
-        if (ids is None or len(ids) < LEAST_CORNERS) and marker_ids is not None:
+        if (ids is None or len(ids) < MIN_CORNERS) and marker_ids is not None:
             pixels, ids = old.detectBoard(grey, markerCorners=markers, markerIds=marker_ids)[:2]
-        if pixels is None or ids is None or len(ids) < LEAST_CORNERS:
+        if pixels is None or ids is None or len(ids) < MIN_CORNERS:
             return None
         ids = np.asarray(ids).ravel().astype(int)
         on_board = self.corners_m[ids]
         if np.linalg.matrix_rank(on_board - on_board[0], tol=self.square_m / 2) < 2:
             return None
         found = np.asarray(pixels, np.float64).reshape(-1, 2) + 0.5
-        return Corners(ids, refined(grey, found, on_board[:, :2], self.square_m, self.marker_m))
+        return Corners(ids, refine_corners(grey, found, on_board[:, :2], self.square_m, self.marker_m))
 
 
 def parse_board(text: str, dictionary: str) -> Board:
-    """A board from COLUMNSxROWS:SQUARE_M:MARKER_M and the name of OpenCV's dictionary; ValueError from other text."""
+    """Parse COLUMNSxROWS:SQUARE_M:MARKER_M and an OpenCV dictionary's name; ValueError for other text."""
     parts = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+):(\d*\.?\d+)", text)
     if parts is None:
         example = "8x6:0.06:0.045 for 8 x 6 squares of 6 cm with markers of 4.5 cm"
@@ -203,7 +206,10 @@ def parse_board(text: str, dictionary: str) -> Board:
 
 
 def open_footage(folder: Path) -> NativeCalibration:
-    """The cameras of two or more videos or folders of images in a folder, by name, with placeholder K and poses."""
+    """Open the videos or image folders of a folder as cameras, with placeholders for K and poses.
+
+    CaptureError if there are fewer than two.
+    """
     entries = sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
     videos = {entry.stem: entry.name for entry in entries if entry.is_file() and is_video(entry.name)}
     chosen = videos or {
@@ -225,13 +231,13 @@ def open_footage(folder: Path) -> NativeCalibration:
     return NativeCalibration(footage.frames, cameras, None, footage.fps, None, 1.0, folder, folder)
 
 
-def look_for(
+def find_board(
     board: Board,
     footage: NativeCalibration,
     times: Sequence[int],
     track: Callable[[Sequence[NativeCamera]], Iterable[NativeCamera]],
 ) -> dict[tuple[int, int], Corners]:
-    """The board's corners, by camera and time, at these indices of the footage's frames.
+    """Find the board in these frames of all cameras; returns corners by index of camera and frame.
 
     `track` wraps the cameras that are iterated over, as a progress bar. CaptureError if an image
     cannot be read, or has another size than the camera's first.

@@ -1,4 +1,4 @@
-"""Cameras from the corners of a board that was moved about: each camera by itself, then all together.
+"""Calibrates cameras from the corners of a moving board: each camera by itself, then all together.
 
 OpenCV calibrates each camera first; cameras are chained by the times at which two of them see the
 board. The bundle adjustment then moves all cameras and all poses of the board until corners lie
@@ -21,91 +21,98 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.preprocess.calibration.board import Board, Corners
 from viewmend.utils.contact_sheet import Tile, contact_sheet, in_rows
 
-LEAST_VIEWS = 5
-"""Images of the board that a camera needs."""
-MOST_VIEWS = 40
-"""Images used for the first calibration of a camera; the adjustment uses all."""
-CAMERA = 12
-"""A camera has this many parameters: fx, fy, cx, cy, k1, k2, rotation and translation."""
-POSE = 6
-"""The board's pose at one time has this many parameters: rotation and translation."""
+MIN_VIEWS = 5
+"""Smallest number of images of the board that a camera needs."""
+MAX_VIEWS = 40
+"""Largest number of images for the first calibration of a camera; the bundle adjustment
+uses all."""
+CAMERA_PARAMETERS = 12
+"""Number of parameters of a camera: fx, fy, cx, cy, k1, k2, rotation and translation."""
+POSE_PARAMETERS = 6
+"""Number of parameters of the board's pose in one frame: rotation and translation."""
 OUTLIER_PX = 0.3
-"""Residuals above this count less: corners of boards that are seen aslant are found less well."""
+"""Residuals above this many pixels count less: corners of boards seen at a slant are found
+less well."""
 CENTRE_PX = 0.05
-"""The principal point is expected in the middle, to this share of the image's size; a weak prior."""
+"""Standard deviation of the principal point from the middle of the image, as a fraction of its
+size: a weak prior."""
 STEPS = 60
 
-Seen = Mapping[tuple[int, int], Corners]
-"""What was found, by camera and time."""
+Detections = Mapping[tuple[int, int], Corners]
+"""Corners by index of the camera and of the frame."""
 Size = tuple[int, int]
 Matrix = Float64[np.ndarray, "3 3"]
 Distortion = Float64[np.ndarray, "5"]
 Pose = Float64[np.ndarray, "4 4"]
-Picture = UInt8[np.ndarray, "height width 3"]
-ENLARGED = 100
-"""Scale at which residuals are drawn."""
+Image = UInt8[np.ndarray, "height width 3"]
+RESIDUAL_SCALE = 100
+"""Factor by which residuals are enlarged in the drawing."""
 TILE_PX = 480
 
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """One camera, and what its calibration misses."""
+    """One calibrated camera, and its residuals."""
 
     K: Matrix
     """Pixels; the top-left pixel has its centre at (0.5, 0.5)."""
     dist: Distortion
-    """k1 k2 0 0 0 of Brown and Conrady."""
+    """Distortion coefficients k1 k2 0 0 0 (Brown-Conrady)."""
     camera_from_world: Pose
     corners: Float64[np.ndarray, "corner 2"]
-    """Where corners were found, pixels."""
-    off: Float64[np.ndarray, "corner 2"]
+    """Detected corners, pixels."""
+    residuals_px: Float64[np.ndarray, "corner 2"]
     """Residuals in pixels: projections of the corners minus where they were found."""
 
     @property
     def rms_px(self) -> float:
-        """Root mean square distance of the corners."""
-        return float(np.sqrt((self.off**2).sum(1).mean()))
+        """Root mean square reprojection error, pixels."""
+        return float(np.sqrt((self.residuals_px**2).sum(1).mean()))
 
 
 def calibrate(
-    seen: Seen, board: Board, names: Sequence[str], sizes: Sequence[Size]
+    detections: Detections, board: Board, names: Sequence[str], sizes: Sequence[Size]
 ) -> list[CalibratedCamera]:
-    """The cameras of these names and image sizes (width, height) from what they saw of the board.
+    """Calibrate the cameras of these names and image sizes (width, height) from their views of the board.
 
     ValueError if a camera saw the board too seldom, or never together with the others.
     """
-    alone = [_alone(seen, board, view, name, sizes[view]) for view, name in enumerate(names)]
-    poses = {key: _board_pose(corners, board, *alone[key[0]]) for key, corners in seen.items()}
-    cameras = _chained(poses, names)
-    times = sorted({time for _, time in seen})
+    intrinsics = [
+        _calibrate_alone(detections, board, view, name, sizes[view]) for view, name in enumerate(names)
+    ]
+    poses = {key: _board_pose(corners, board, *intrinsics[key[0]]) for key, corners in detections.items()}
+    cameras = _chain_poses(poses, names)
+    times = sorted({time for _, time in detections})
     start = [
         np.concatenate([K[[0, 1, 0, 1], [0, 1, 2, 2]], dist[:2], _vector(cameras[view])])
-        for view, (K, dist) in enumerate(alone)
+        for view, (K, dist) in enumerate(intrinsics)
     ]
     for time in times:
-        view = max((v for v, t in seen if t == time), key=lambda v: len(seen[v, time].ids))
+        view = max((v for v, t in detections if t == time), key=lambda v: len(detections[v, time].ids))
         start.append(_vector(np.linalg.inv(cameras[view]) @ poses[view, time]))
-    rows = _Rows(seen, board, sizes, times)
+    problem = _Residuals(detections, board, sizes, times)
     found = least_squares(
-        rows.residuals,
+        problem.residuals,
         np.concatenate(start),
-        jac_sparsity=rows.sparsity(),
+        jac_sparsity=problem.sparsity(),
         x_scale="jac",
         loss="soft_l1",
         f_scale=OUTLIER_PX,
         max_nfev=STEPS,
     )
-    return rows.cameras(found.x)
+    return problem.cameras(found.x)
 
 
-def _alone(seen: Seen, board: Board, view: int, name: str, size: Size) -> tuple[Matrix, Distortion]:
-    own = sorted((corners for (v, _), corners in seen.items() if v == view), key=lambda c: -len(c.ids))
-    if len(own) < LEAST_VIEWS:
+def _calibrate_alone(
+    detections: Detections, board: Board, view: int, name: str, size: Size
+) -> tuple[Matrix, Distortion]:
+    own = sorted((corners for (v, _), corners in detections.items() if v == view), key=lambda c: -len(c.ids))
+    if len(own) < MIN_VIEWS:
         raise ValueError(
-            f"camera '{name}': expected the board in {LEAST_VIEWS} images or more, found it in {len(own)}; check "
+            f"camera '{name}': expected the board in {MIN_VIEWS} images or more, found it in {len(own)}; check "
             "--board and --dictionary, show it larger, sharper and tilted, or look at more frames (--every 1)"
         )
-    own = own[:: max(1, len(own) // MOST_VIEWS)][:MOST_VIEWS]
+    own = own[:: max(1, len(own) // MAX_VIEWS)][:MAX_VIEWS]
     points = [board.corners_m[c.ids].astype(np.float32)[None] for c in own]
     pixels = [c.pixels.astype(np.float32)[None] for c in own]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
@@ -114,15 +121,18 @@ def _alone(seen: Seen, board: Board, view: int, name: str, size: Size) -> tuple[
 
 
 def _board_pose(corners: Corners, board: Board, K: Matrix, dist: Distortion) -> Pose:
-    """camera_from_board by one image."""
+    """Estimate camera_from_board from one image."""
     _, turn, shift = cv2.solvePnP(
         board.corners_m[corners.ids], corners.pixels, K, dist, flags=cv2.SOLVEPNP_IPPE
     )
     return _matrix(np.concatenate([turn.ravel(), shift.ravel()]))
 
 
-def _chained(poses: Mapping[tuple[int, int], Pose], names: Sequence[str]) -> dict[int, Pose]:
-    """camera_from_world of all, world being the first: each is joined to the known one with most times in common."""
+def _chain_poses(poses: Mapping[tuple[int, int], Pose], names: Sequence[str]) -> dict[int, Pose]:
+    """Chain camera_from_world of all cameras, starting at the first one, whose frame is the world.
+
+    Each camera is joined to the known one with which it shares most frames.
+    """
     known = {0: np.eye(4)}
     times = [{time for v, time in poses if v == view} for view in range(len(names))]
     while len(known) < len(names):
@@ -150,23 +160,23 @@ def _matrix(vector: Float64[np.ndarray, "6"]) -> Pose:
     return pose
 
 
-class _Rows:
-    """The residuals of all corners, x and y of each, as one vector of the parameters."""
+class _Residuals:
+    """The residuals of all corners, x and y of each, as a function of one parameter vector."""
 
-    def __init__(self, seen: Seen, board: Board, sizes: Sequence[Size], times: Sequence[int]):
-        keys = sorted(seen)
+    def __init__(self, detections: Detections, board: Board, sizes: Sequence[Size], times: Sequence[int]):
+        keys = sorted(detections)
         self.views = len(sizes)
         self.times = len(times)
         self.size = np.array(sizes, float)
-        self.pixels = np.concatenate([seen[key].pixels for key in keys])
-        self.points = np.concatenate([board.corners_m[seen[key].ids] for key in keys])
-        counts = [len(seen[key].ids) for key in keys]
+        self.pixels = np.concatenate([detections[key].pixels for key in keys])
+        self.points = np.concatenate([board.corners_m[detections[key].ids] for key in keys])
+        counts = [len(detections[key].ids) for key in keys]
         self.view = np.repeat([view for view, _ in keys], counts)
         self.time = np.repeat([times.index(time) for _, time in keys], counts)
 
     def residuals(self, x: Float64[np.ndarray, "parameter"]) -> Float64[np.ndarray, "residual"]:
         """Reprojection errors of all corners in pixels, followed by the residuals of the prior."""
-        camera, pose = self._split(x)
+        camera, pose = self._unpack(x)
         turns = Rotation.from_rotvec(pose[:, :3]).as_matrix()[self.time]
         world = np.einsum("pij,pj->pi", turns, self.points) + pose[self.time, 3:]
         of = camera[self.view]
@@ -179,41 +189,46 @@ class _Rows:
         return np.concatenate([(of[:, :2] * at + of[:, 2:4] - self.pixels).ravel(), prior.ravel()])
 
     def sparsity(self) -> object:
-        """Which residual depends on which parameter; the first camera stays where it is."""
+        """The residuals that depend on each parameter; the first camera's pose is fixed."""
         corners = len(self.view)
         sparsity = lil_matrix(
-            (2 * (corners + self.views), CAMERA * self.views + POSE * self.times), dtype=int
+            (2 * (corners + self.views), CAMERA_PARAMETERS * self.views + POSE_PARAMETERS * self.times),
+            dtype=int,
         )
         rows = np.arange(corners)
         for axis in range(2):
-            for n in range(CAMERA):
+            for n in range(CAMERA_PARAMETERS):
                 moves = rows if n < 6 else rows[self.view > 0]
-                sparsity[2 * moves + axis, CAMERA * self.view[moves] + n] = 1
-            for n in range(POSE):
-                sparsity[2 * rows + axis, CAMERA * self.views + POSE * self.time + n] = 1
+                sparsity[2 * moves + axis, CAMERA_PARAMETERS * self.view[moves] + n] = 1
+            for n in range(POSE_PARAMETERS):
+                sparsity[
+                    2 * rows + axis, CAMERA_PARAMETERS * self.views + POSE_PARAMETERS * self.time + n
+                ] = 1
             views = np.arange(self.views)
-            sparsity[2 * (corners + views) + axis, CAMERA * views + 2 + axis] = 1
+            sparsity[2 * (corners + views) + axis, CAMERA_PARAMETERS * views + 2 + axis] = 1
         return sparsity
 
     def cameras(self, x: Float64[np.ndarray, "parameter"]) -> list[CalibratedCamera]:
-        """The cameras that the parameters mean."""
-        off = self.residuals(x)[: self.pixels.size].reshape(-1, 2)
-        camera = self._split(x)[0]
+        """The cameras for these parameters."""
+        residuals_px = self.residuals(x)[: self.pixels.size].reshape(-1, 2)
+        camera = self._unpack(x)[0]
         found = []
         for view, (fx, fy, cx, cy, k1, k2) in enumerate(camera[:, :6]):
             own = self.view == view
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
             dist = np.array([k1, k2, 0, 0, 0])
-            found.append(CalibratedCamera(K, dist, _matrix(camera[view, 6:]), self.pixels[own], off[own]))
+            found.append(
+                CalibratedCamera(K, dist, _matrix(camera[view, 6:]), self.pixels[own], residuals_px[own])
+            )
         return found
 
-    def _split(self, x: Float64[np.ndarray, "parameter"]) -> tuple[np.ndarray, np.ndarray]:
-        end = CAMERA * self.views
-        return x[:end].reshape(self.views, CAMERA), x[end:].reshape(self.times, POSE)
+    def _unpack(self, x: Float64[np.ndarray, "parameter"]) -> tuple[np.ndarray, np.ndarray]:
+        end = CAMERA_PARAMETERS * self.views
+        return x[:end].reshape(self.views, CAMERA_PARAMETERS), x[end:].reshape(self.times, POSE_PARAMETERS)
 
 
 def with_cameras(calibration: NativeCalibration, cameras: Cameras) -> NativeCalibration:
-    """The calibration with K and pose of these cameras; those that are not among them stay as they were."""
+    """Replace K and pose of the cameras in `cameras`; all others are unchanged."""
     changed = []
     for camera in calibration.cameras:
         if camera.name in cameras.names:
@@ -224,23 +239,26 @@ def with_cameras(calibration: NativeCalibration, cameras: Cameras) -> NativeCali
     return replace(calibration, cameras=tuple(changed))
 
 
-def residual_picture(cameras: Sequence[NativeCamera], found: Sequence[CalibratedCamera]) -> Picture:
-    """A tile a camera: a line from each of the board's corners, `ENLARGED` times as long as what is missed."""
+def draw_residuals(cameras: Sequence[NativeCamera], found: Sequence[CalibratedCamera]) -> Image:
+    """Draw a tile per camera: a line from each corner, `RESIDUAL_SCALE` times as long as its residual."""
     tiles = [
         Tile(f"{camera.name}   {one.rms_px:.3f} px, {len(one.corners)} corners", _draw(camera, one))
         for camera, one in zip(cameras, found, strict=True)
     ]
     sheet = contact_sheet(in_rows(tiles, int(np.ceil(np.sqrt(len(tiles))))), TILE_PX)
-    text = f"from where each corner was found to where the calibration has it, {ENLARGED} times as long"
+    text = f"from where each corner was found to where the calibration has it, {RESIDUAL_SCALE} times as long"
     return np.concatenate([sheet, contact_sheet([[Tile(text, None)]], sheet.shape[1] - 8, tile_height=0)])
 
 
-def _draw(camera: NativeCamera, found: CalibratedCamera) -> Picture:
+def _draw(camera: NativeCamera, found: CalibratedCamera) -> Image:
     scale = TILE_PX / camera.width
     image = np.full((max(1, round(camera.height * scale)), TILE_PX, 3), 32, np.uint8)
-    for corner, off in zip(found.corners * scale, found.off * scale * ENLARGED, strict=True):
+    for corner, residuals_px in zip(
+        found.corners * scale, found.residuals_px * scale * RESIDUAL_SCALE, strict=True
+    ):
         start, end = (
-            np.clip(p, -2 * TILE_PX, 3 * TILE_PX).astype(int).tolist() for p in (corner, corner + off)
+            np.clip(p, -2 * TILE_PX, 3 * TILE_PX).astype(int).tolist()
+            for p in (corner, corner + residuals_px)
         )
         cv2.line(image, start, end, (255, 200, 60), 1, cv2.LINE_AA)
         cv2.circle(image, start, 1, (255, 255, 255), -1)

@@ -1,4 +1,4 @@
-"""Cameras refined by silhouettes: the line of sight of each point of an outline must touch what all others see.
+"""Refines cameras by silhouettes: each outline's lines of sight must touch what all other cameras see.
 
 A point of an outline lies on the subject's surface. So somewhere along its line of sight there is a
 place that no other camera sees outside of its mask. How far outside the best one is, in pixels, is
@@ -18,53 +18,49 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from viewmend.data.errors import CaptureError
-from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.line_of_sight import OUTLIER_PX, LinesOfSight, Rig
-from viewmend.geometry.proxy import reconstruct
 from viewmend.geometry.rigid import invert_rigid, rigid
 from viewmend.types import MultiViewFrame
 
 Places = Float64[np.ndarray, "point 3"]
-LEAST_CAMERAS = 3
-"""Fewer cameras do not constrain each other: two masks always have common points."""
-CAMERA = 7
-"""Parameters of a camera: rotation, translation, focal length; each in pixels that it moves what is seen."""
+MIN_CAMERAS = 3
+"""Smallest rig that is refined: two masks alone always have points in common."""
+PARAMETERS = 7
+"""Number of parameters of a camera: rotation, translation and focal length, each scaled so that 1
+moves the image by about a pixel."""
 HOLDS = (1e-3, 0.1)
-"""Strength of the prior on the present cameras, since outlines do not determine everything. The
-second value is for few frames and hard masks; held-out cameras decide which is better."""
+"""Weights of the prior that keeps cameras where they are, since outlines do not determine
+everything. The larger one is for few frames and hard masks; held-out cameras decide which
+is better."""
 SEARCHES = 6
-"""The best places on the lines of sight are searched at most this many times."""
+"""Largest number of searches for the best depths on the lines of sight."""
 STEPS = 6
-"""The cameras move in at most this many steps between two searches."""
-ENOUGH = 0.02
-"""The steps end when one reduces the residual by less than this share."""
+"""Largest number of Levenberg-Marquardt steps between two searches."""
+MIN_GAIN = 0.02
+"""The steps end when one reduces the cost by less than this fraction."""
 DAMPING = 1e-3
-"""The damping of Levenberg and Marquardt begins with this value."""
-MOST_DAMPING = 1e4
-"""The steps end when the damping of Levenberg and Marquardt exceeds this value."""
+"""Damping of the first Levenberg-Marquardt step."""
+MAX_DAMPING = 1e4
+"""The steps end when the damping exceeds this value."""
 Moves = Float64[np.ndarray, "view parameter"]
 Depths = list[Float64[np.ndarray, "_point"]]
-"""The z-depth of each line of sight's place, for each time."""
-LEFT_OUT = 3
-"""Number of cameras that are held out in turn, spread over the rig."""
-LEFT_OUT_TIMES = 2
-"""Number of frames that are held out in turn, if there are several."""
-MARGIN = 0.1
-"""How much larger than the hull the box is that may hold the subject, to each side."""
+"""The z-depth of the best point on each line of sight, metres, for each frame."""
 
 
-def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
-    """The rig turned, moved and scaled as a whole, so that its cameras agree with `reference` on the points.
+def align_rig(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
+    """Rotate, move and scale a rig as a whole so that its cameras agree with `reference` on the points.
 
     `reference` has the same cameras in the frame that is wanted, in which `points_world` are where
     the subject may be. The rotation, translation and scale are Umeyama's, of the points in each
     camera's own frame (PAMI 1991).
     """
-    there = torch.cat([points_world, torch.ones_like(points_world[:, :1])], 1).double()
-    here = there @ reference.camera_from_world.double().mT @ invert_rigid(rig.camera_from_world.double()).mT
-    source = here[..., :3].reshape(-1, 3).cpu().numpy()
+    points = torch.cat([points_world, torch.ones_like(points_world[:, :1])], 1).double()
+    in_cameras = (
+        points @ reference.camera_from_world.double().mT @ invert_rigid(rig.camera_from_world.double()).mT
+    )
+    source = in_cameras[..., :3].reshape(-1, 3).cpu().numpy()
     R, t, scale = _similarity(source, points_world.double().repeat(len(rig), 1).cpu().numpy())
     pose = rig.camera_from_world.double()
     turned = pose[:, :3, :3] @ torch.from_numpy(R.T).to(pose)
@@ -75,7 +71,7 @@ def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "po
 def _similarity(
     source: Places, target: Places
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
-    """R, t and s for which s R x + t is nearest to the targets."""
+    """Find R, t and s for which s R x + t is nearest to the targets."""
     a = source - source.mean(0)
     b = target - target.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
@@ -87,20 +83,20 @@ def _similarity(
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined cameras, and what they miss."""
+    """Refined cameras, and the residuals before and after."""
 
     cameras: Cameras
     before_px: float
-    """How far a line of sight of an outline is outside the other masks at best, root mean square,
-    as calibrated."""
+    """Root mean square distance of the lines of sight from the other masks, at their best depths,
+    before the refinement; pixels."""
     after_px: float
-    """The same, refined."""
+    """The same after the refinement."""
 
 
 def refine_by_silhouettes(
     frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float
 ) -> Refinement:
-    """Refine poses and focal lengths of `LEAST_CAMERAS` or more; several frames constrain them better than one.
+    """Refine poses and focal lengths of at least `MIN_CAMERAS` cameras; several frames constrain them better.
 
     The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one
     for each frame; `hold` is one of `HOLDS`. Here and below, a CaptureError is raised for frames
@@ -109,25 +105,25 @@ def refine_by_silhouettes(
     cameras = frames[0].cameras
     sights = [lines_of_sight(frame, box) for frame, box in zip(frames, bounds, strict=True)]
     problem = _Problem(sights, Rig.from_cameras(cameras), hold)
-    x = np.zeros((len(cameras), CAMERA))
-    depths = problem.searched(x)
-    before_px = problem.missed_px(x, depths)
+    x = np.zeros((len(cameras), PARAMETERS))
+    depths = problem.search(x)
+    before_px = problem.residual_px(x, depths)
     for _ in range(SEARCHES):
         cost = problem.cost(x, depths)
-        x = problem.solved(x, depths)
-        depths = problem.searched(x)
-        if problem.cost(x, depths) > (1 - ENOUGH) * cost:
+        x = problem.solve(x, depths)
+        depths = problem.search(x)
+        if problem.cost(x, depths) > (1 - MIN_GAIN) * cost:
             break
     rig = problem.rig(x)
     pose = cameras.camera_from_world.clone()
     pose[:, :3] = torch.from_numpy(np.concatenate([rig.R, rig.t[..., None]], 2)).to(pose)
     found = replace(cameras, K=torch.from_numpy(rig.K).to(cameras.K), camera_from_world=pose)
     corners = torch.cat([box.corners for box in bounds])
-    return Refinement(brought_to(found, cameras, corners), before_px, problem.missed_px(x, depths))
+    return Refinement(align_rig(found, cameras, corners), before_px, problem.residual_px(x, depths))
 
 
 def lines_of_sight(frame: MultiViewFrame, bounds: Bounds) -> LinesOfSight:
-    """The lines of sight through the outlines of one frame's masks."""
+    """Compute the lines of sight through the outlines of one frame's masks."""
     if frame.mask is None:
         raise CaptureError("expected frames with masks, got none; make them with viewmend masks")
     return LinesOfSight.from_masks(frame.mask, frame.cameras, bounds)
@@ -142,15 +138,15 @@ class _Problem:
         middle = np.mean([sight.middle for sight in sights], 0)
         far_m = np.linalg.norm(start.R @ middle + start.t, axis=1)
         m_per_px = far_m / start.K[:, 0, 0]
-        self.units = np.empty((len(start.K), CAMERA))
-        """What moves a camera's image by about a pixel."""
+        self.units = np.empty((len(start.K), PARAMETERS))
+        """Parameters that move a camera's image by about a pixel."""
         self.units[:, :3] = (m_per_px / far_m)[:, None]
         self.units[:, 3:6] = m_per_px[:, None]
         self.units[:, 6] = m_per_px / max(sight.radius_m for sight in sights)
         self.hold = hold * sum(len(sight.view) for sight in sights) / len(start.K)
 
     def rig(self, x: Moves) -> Rig:
-        """The cameras, moved by `x`."""
+        """Move the cameras by `x`."""
         by = x * self.units
         turn = Rotation.from_rotvec(by[:, :3]).as_matrix()
         K = self.start.K.copy()
@@ -158,16 +154,16 @@ class _Problem:
         t = np.einsum("vij,vj->vi", turn, self.start.t) + by[:, 3:6]
         return Rig(K, turn @ self.start.R, t)
 
-    def solved(self, x: Moves, depths: Depths) -> Moves:
-        """The moves at which least is missed, of places near the given ones (Levenberg and Marquardt)."""
+    def solve(self, x: Moves, depths: Depths) -> Moves:
+        """Minimise the cost over the cameras (Levenberg-Marquardt); depths follow from the given ones."""
         cost = self.cost(x, depths)
         damping = DAMPING
         for _ in range(STEPS):
             H, g = self.normal_equations(x, depths)
-            while damping < MOST_DAMPING:
+            while damping < MAX_DAMPING:
                 moved = x + np.linalg.solve(H + damping * np.diag(np.diag(H)), -g).reshape(x.shape)
-                tried = self.refined(moved, depths)
-                new = self.cost(moved, tried)
+                depths_there = self.refine(moved, depths)
+                new = self.cost(moved, depths_there)
                 if new < cost:
                     break
                 damping *= 10
@@ -175,67 +171,72 @@ class _Problem:
                 break
             gain = 1 - new / cost
             x = moved
-            depths = tried
+            depths = depths_there
             cost = new
             damping = damping / 10
-            if gain < ENOUGH:
+            if gain < MIN_GAIN:
                 break
         return x
 
-    def searched(self, x: Moves) -> Depths:
-        """The best places of all."""
+    def search(self, x: Moves) -> Depths:
+        """Search all depths for the best ones."""
         rig = self.rig(x)
         return [sight.search_depths(rig) for sight in self.sights]
 
-    def refined(self, x: Moves, depths: Depths) -> Depths:
-        """The best places about the given ones."""
+    def refine(self, x: Moves, depths: Depths) -> Depths:
+        """Refine the given depths locally."""
         rig = self.rig(x)
         return [sight.refine_depths(rig, depth) for sight, depth in zip(self.sights, depths, strict=True)]
 
     def cost(self, x: Moves, depths: Depths) -> float:
-        """Half the sum of squared distances to the masks, plus the cost of moving the cameras."""
-        return float(0.5 * sum(self._missed(x, depths)) + 0.5 * self.hold * (x**2).sum())
+        """Half the sum of squared residuals, plus the prior."""
+        return float(0.5 * sum(self._squared_residuals(x, depths)) + 0.5 * self.hold * (x**2).sum())
 
-    def missed_px(self, x: Moves, depths: Depths) -> float:
-        """Root mean square distance of the places to the masks."""
-        return float(np.sqrt(sum(self._missed(x, depths)) / sum(len(sight.view) for sight in self.sights)))
+    def residual_px(self, x: Moves, depths: Depths) -> float:
+        """Root mean square residual, pixels."""
+        return float(
+            np.sqrt(sum(self._squared_residuals(x, depths)) / sum(len(sight.view) for sight in self.sights))
+        )
 
-    def _missed(self, x: Moves, depths: Depths) -> list[float]:
+    def _squared_residuals(self, x: Moves, depths: Depths) -> list[float]:
         rig = self.rig(x)
-        looks = zip(self.sights, depths, strict=True)
-        return [float(sight.sample(rig, depth[:, None]).residuals.sum()) for sight, depth in looks]
+        pairs = zip(self.sights, depths, strict=True)
+        return [float(sight.sample(rig, depth[:, None]).residuals.sum()) for sight, depth in pairs]
 
     def normal_equations(
         self, x: Moves, depths: Depths
     ) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"]]:
-        """Gauss and Newton's, without the places' own depths, which follow."""
+        """Gauss-Newton's Hessian and gradient for the cameras; the depths, which follow, are eliminated."""
         rig = self.rig(x)
         H = self.hold * np.eye(x.size)
         g = self.hold * x.ravel()
         for sight, depth in zip(self.sights, depths, strict=True):
-            J, r = self._rows(sight, rig, depth)
+            J, r = self._linearize(sight, rig, depth)
             rows = J.reshape(-1, x.size)
             H += rows.T @ rows
             g += rows.T @ r.ravel()
         return H, g
 
-    def _rows(
+    def _linearize(
         self, sight: LinesOfSight, rig: Rig, depth: Float64[np.ndarray, "point"]
     ) -> tuple[Float64[np.ndarray, "point view view parameter"], Float64[np.ndarray, "point view"]]:
-        """What each place is outside of each mask, weighted, and how the cameras change it where its depth follows."""
+        """Linearise the weighted residuals of each line of sight in the cameras' parameters.
+
+        Returns the Jacobian, in which depths follow, and the residuals of each mask.
+        """
         seen = sight.sample(rig, depth[:, None])
         place = seen.in_camera[:, 0]
         outside_px = seen.outside_px[:, 0]
         by_place = seen.gradient(rig)[:, 0]
         views = np.arange(len(rig.K))
-        J = np.zeros((*outside_px.shape, len(views), CAMERA))
-        J[:, views, views] = _by_camera(place, by_place)
+        J = np.zeros((*outside_px.shape, len(views), PARAMETERS))
+        J[:, views, views] = _camera_derivatives(place, by_place)
         # The line starts in its own camera, which moves the place itself, the other way.
         ray = sight.rays(rig)
         points = np.arange(len(depth))
         own = sight.view
         by_own = np.einsum("pvi,vij,pkj->pvk", by_place, rig.R, rig.R[own])
-        J[points, :, own] -= _by_camera((ray * depth[:, None])[:, None], by_own)
+        J[points, :, own] -= _camera_derivatives((ray * depth[:, None])[:, None], by_own)
         weight = (1 + (outside_px / OUTLIER_PX) ** 2) ** -0.25
         J *= weight[..., None, None] * self.units
         r = outside_px * weight
@@ -245,78 +246,10 @@ class _Problem:
         return J, r - along * (along * r).sum(1, keepdims=True)
 
 
-def _by_camera(
+def _camera_derivatives(
     place: Float64[np.ndarray, "point #view 3"], by_place: Float64[np.ndarray, "point view 3"]
 ) -> Float64[np.ndarray, "point view parameter"]:
-    """Derivatives by a camera's parameters of a value whose derivative by a place in its frame is known."""
+    """Chain rule from the derivative by a point in a camera's frame to that by the camera's parameters."""
     place = np.broadcast_to(place, by_place.shape)
     by_focal = (by_place[..., :2] * place[..., :2]).sum(-1, keepdims=True)
     return np.concatenate([np.cross(place, by_place), by_place, by_focal], -1)
-
-
-@dataclass(frozen=True)
-class HeldOutIou:
-    """How a hull of the others' masks agrees with the mask of a camera that was left out."""
-
-    camera: str
-    before: float
-    """Intersection over union of its silhouette and the mask, with the cameras as given."""
-    after: float
-    """The same, with the other cameras refined by their masks alone and this camera unchanged."""
-
-
-def refined_without(
-    frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float
-) -> HeldOutIou:
-    """Refine all cameras but one, and look at the hull through that one."""
-    others = [frame.without([name]) for frame in frames]
-    held = [frame.select([name]) for frame in frames]
-    refined = refined_all(others, bounds, hold).cameras
-    before, after = (_iou(others, held, cameras, bounds) for cameras in (others[0].cameras, refined))
-    return HeldOutIou(name, before, after)
-
-
-def missed_px(frames: Sequence[MultiViewFrame], left: int, bounds: Bounds | None, hold: float) -> float:
-    """What outlines miss at the time `frames[left]`, pixels, root mean square, with cameras refined by the others."""
-    refined = refined_all([frame for time, frame in enumerate(frames) if time != left], bounds, hold).cameras
-    sight = lines_of_sight(frames[left], _around_subject(frames[left], bounds))
-    return float(np.sqrt(sight.least_residuals(Rig.from_cameras(refined)).mean()))
-
-
-def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: float) -> Refinement:
-    """Refine all cameras of the frames; `bounds` are the capture's, where it has any, `hold` one of `HOLDS`."""
-    return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames], hold)
-
-
-def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
-    """The one of `HOLDS` that serves left-out frames best; with a single frame, left-out cameras."""
-    if len(frames) > 1:
-        times = range(min(LEFT_OUT_TIMES, len(frames)))
-        return min(HOLDS, key=lambda hold: sum(missed_px(frames, time, bounds, hold) for time in times))
-    names = left_out(frames[0].cameras.names)
-    return max(
-        HOLDS, key=lambda hold: sum(refined_without(frames, name, bounds, hold).after for name in names)
-    )
-
-
-def left_out(names: Sequence[str]) -> list[str]:
-    """The cameras to leave out in turn."""
-    count = min(LEFT_OUT, len(names))
-    return [names[len(names) * number // count] for number in range(count)]
-
-
-def _around_subject(frame: MultiViewFrame, bounds: Bounds | None) -> Bounds:
-    assert frame.mask is not None
-    found = reconstruct(frame.mask, frame.cameras, bounds).bounds
-    return Bounds(found.low - MARGIN * found.size_m, found.high + MARGIN * found.size_m)
-
-
-def _iou(
-    others: Sequence[MultiViewFrame], held: Sequence[MultiViewFrame], cameras: Cameras, bounds: Bounds | None
-) -> float:
-    scores = []
-    for frame, own in zip(others, held, strict=True):
-        assert frame.mask is not None and own.mask is not None
-        proxy = reconstruct(frame.mask, cameras, bounds)
-        scores.append(float(silhouette_iou(proxy.depth(own.cameras) > 0, own.mask).nan_to_num(1.0).mean()))
-    return sum(scores) / len(scores)
