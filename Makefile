@@ -12,7 +12,7 @@ CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/te
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 
-.PHONY: demo test test-all tests slow shapes kernels gate pyright docs format clean
+.PHONY: demo pictures test test-all tests slow shapes kernels gate pyright docs format clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
@@ -36,6 +36,9 @@ kernels: .venv/installed ## compiled once, not by each worker
 
 docs: .venv/installed ## the documentation site, in out/site; strict, and nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+pictures: .venv/installed ## the pictures of the README and the documents, as the package draws them now
+	$(BIN)/python research/make_pictures.py
 
 gate: .venv/installed
 	$(BIN)/ruff format --check .

@@ -217,6 +217,7 @@ class Page {
     this.notices.arrived(this.settings.modes.includes("confidence") && header.full && header.confidence === null);
     if (header.full) this.refining.finish();
     this.paint();
+    if (this.drawn !== null && this.stage.fading) this.wake(false);
     const latency = this.statistics.picture(header, shown.bytes);
     Object.assign(this.canvas.dataset, { frame: header.frame, look: header.look, time: header.time, full: header.full });
     this.canvas.dispatchEvent(new CustomEvent("framepainted", { detail: { header, bytes: shown.bytes, latency_ms: latency } }));
