@@ -24,6 +24,7 @@ from measure import write
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.data.loose_masks import find_loose_masks
 from viewmend.evaluation.scores import Scorers, TrueView, score_view, true_view
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh, vertex_normals
@@ -35,7 +36,7 @@ from viewmend.models.base import RenderQuality
 from viewmend.models.compositing import composite
 from viewmend.models.registry import make_method
 from viewmend.rendering.view import RenderConfig, render_depth
-from viewmend.scenes.capture_scenes import capture_set
+from viewmend.scenes.capture_scenes import CaptureScene, capture_set
 from viewmend.scenes.held_out import LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.stream import Stream, StreamConfig
@@ -77,13 +78,29 @@ def main() -> None:
     parser.add_argument(
         "--proxy", choices=PROXIES, default="hull", help="geometry behind which views are rendered"
     )
+    parser.add_argument(
+        "--grow-masks", type=int, default=0, help="make the inputs' masks this many pixels too wide"
+    )
+    parser.add_argument(
+        "--no-tighten-masks", action="store_true", help="leave loose masks of captures as they are"
+    )
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each model")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
     found = {name: judge(some(name, options.size, options.views), options) for name in options.sets}
     if options.write:
         config = {
-            key: getattr(options, key) for key in ("models", "sets", "views", "size", "background", "proxy")
+            key: getattr(options, key)
+            for key in (
+                "models",
+                "sets",
+                "views",
+                "size",
+                "background",
+                "proxy",
+                "grow_masks",
+                "no_tighten_masks",
+            )
         }
         print(write("whole_views", "cpu", config, found))
 
@@ -180,7 +197,7 @@ def completed_views(
     scene: LeaveOneOutScene, options: argparse.Namespace, number: int
 ) -> Iterator[tuple[str, CompletedView, TrueView]]:
     """The first frame of a scene by each model, and the truth."""
-    frame = next(iter(scene.frames()))
+    frame = first_frame(scene, options)
     truth, target = true_view(frame.truth, options.background), frame.truth.cameras
     geometry = other_geometry(scene, frame, target, options.proxy, number)
     for model in options.models:
@@ -198,6 +215,24 @@ def completed_views(
             yield model, stream.mend(view, quality=quality).completed, truth
         else:
             yield model, stream.view(target, quality=quality).completed, truth
+
+
+def first_frame(scene: LeaveOneOutScene, options: argparse.Namespace) -> LeaveOneOutFrame:
+    """The first frame of a scene; the masks of its inputs are grown, then tightened, if the options say so."""
+    grown_px, tighten = options.grow_masks, not options.no_tighten_masks
+    if isinstance(scene, CaptureScene):
+        scene = replace(scene, tighten_masks=tighten and not grown_px)
+    frame = next(iter(scene.frames()))
+    if not grown_px:
+        return frame
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown_px + 1, 2 * grown_px + 1))
+    masks = frame.inputs.mask
+    assert masks is not None, "scenes have masks"
+    grown = replace(
+        frame.inputs, mask=torch.stack([torch.from_numpy(cv2.dilate(own.numpy(), disc)) for own in masks])
+    )
+    loose = find_loose_masks(grown) if tighten else None
+    return replace(frame, inputs=grown if loose is None else loose.apply(grown))
 
 
 def other_geometry(

@@ -155,7 +155,7 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     capture = open_masked(options.source, format=options.format)
     times = chosen_times(options.frames, len(capture.frame_ids))
     count = min(options.num_frames, len(times))
-    prepared = prepare(capture, match_colours=False, first=times[0])
+    prepared = prepare(capture, match_colours=False, tighten_masks=False, first=times[0])
     read = [prepared.read(times[len(times) * number // count]) for number in range(count)]
     read = [frame for frame in read if frame.has_subject]
     if not read:

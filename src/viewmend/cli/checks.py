@@ -67,6 +67,9 @@ class PreparationOptions:
     match_colours: Annotated[bool, NEGATED] = True
     """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one
     frame, if they then agree better on held-out surface points."""
+    tighten_masks: Annotated[bool, NEGATED] = True
+    """Use the masks as they are. By default, masks that extend beyond the subject, judging by the
+    colours along the outline in one frame, are tightened by that width."""
 
 
 def check_least(options: object, **least: int) -> None:

@@ -256,7 +256,13 @@ def _make_studio(options: Options) -> "CaptureSource":
     config = StudioConfig(
         seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
     )
-    return prepare(Studio(config), max_image_size=options.max_image_size, align=False, match_colours=False)
+    return prepare(
+        Studio(config),
+        max_image_size=options.max_image_size,
+        align=False,
+        match_colours=False,
+        tighten_masks=False,
+    )
 
 
 def _serve_on_ray(options: Options, address: str) -> NoReturn:

@@ -1,7 +1,7 @@
-"""Preparing a capture: check it, align it on its input cameras, match colours, limit the image size.
+"""Preparing a capture: check it, align it on its input cameras, match colours, tighten masks, limit the image size.
 
-`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`; `train` does not
-match colours, and `serve` limits the image size. Serious faults of a capture raise a
+`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`; `train` changes
+neither colours nor masks, and `serve` limits the image size. Serious faults of a capture raise a
 `CaptureError`; others are logged once as warnings of the logger `viewmend`.
 """
 
@@ -16,6 +16,7 @@ from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
 from viewmend.data.errors import CaptureError, Issue, without_consequences
+from viewmend.data.loose_masks import LooseMasks, find_loose_masks
 from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.cameras import Cameras
@@ -43,12 +44,14 @@ class PreparedCapture(CaptureWrapper):
     """Cameras that disagree with all others and are therefore absent from every frame."""
     colours: ColourMatch | None = None
     """Colour corrections of the input cameras; None if colours stay as they are."""
+    loose_masks: LooseMasks | None = None
+    """The input cameras whose masks are tightened, and by how much; None if masks stay as they are."""
     _reported: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @property
     def changes(self) -> tuple[str, ...]:
         """What preparation has changed, as sentences for the user."""
-        changes = [] if self.colours is None else [self.colours.summary]
+        changes = [found.summary for found in (self.colours, self.loose_masks) if found is not None]
         if self.alignment is not None and self.alignment.offset_px != (0.0, 0.0):
             x, y = self.alignment.offset_px
             changes.append(
@@ -98,7 +101,9 @@ class PreparedCapture(CaptureWrapper):
             raise CaptureError(f"{where}: expected at least one correct mask, got none; redo them")
         frame = limit_size(frame.without(bad), self.max_image_size)
         frame = replace(frame, cameras=self.cameras.select(frame.cameras.names))
-        return frame if self.colours is None else self.colours.apply(frame)
+        if self.colours is not None:
+            frame = self.colours.apply(frame)
+        return frame if self.loose_masks is None else self.loose_masks.apply(frame)
 
 
 def prepare(
@@ -108,10 +113,11 @@ def prepare(
     max_image_size: int | None = None,
     align: bool = True,
     match_colours: bool = True,
+    tighten_masks: bool = True,
     first: int = 0,
     last: int | None = None,
 ) -> PreparedCapture:
-    """Check and align a capture, match its colours, and limit its image size.
+    """Check and align a capture, match its colours, tighten its masks, and limit its image size.
 
     Args:
         source: the capture.
@@ -122,6 +128,8 @@ def prepare(
             look for out-of-sync cameras in the frames around it: `first_with_subject`.
         match_colours: match the input cameras' colours in the same frame, if that improves their
             agreement on parts of the surface that the correction was not fitted to.
+        tighten_masks: tighten the input cameras' masks that extend beyond the subject, judging by
+            colour in the same frame: `find_loose_masks`.
         first: index of the first frame that will be used.
         last: index of the last frame that will be used, at which synchronisation is checked again.
 
@@ -151,15 +159,17 @@ def prepare(
     late = find_desynchronised_cameras(source, frame, last) if align and not fatal else ()
     _raise_or_warn(at, without_consequences(issues, late), reported)
     _raise_or_warn(where, late, reported)
-    prepared = PreparedCapture(source, None, max_image_size, names, left_out, None, reported)
-    return _adjusted(prepared, frame, issues, align, match_colours)
+    prepared = PreparedCapture(source, None, max_image_size, names, left_out, _reported=reported)
+    prepared = _adjusted(prepared, frame, issues, align, match_colours)
+    return replace(prepared, loose_masks=find_loose_masks(frame)) if tighten_masks else prepared
 
 
 def adjustments(source: CaptureSource, frame: MultiViewFrame, issues: Sequence[Issue]) -> tuple[str, ...]:
     """What `prepare` would change, by a frame of good cameras and its issues, in the same words."""
     if not frame.has_subject:
         return ()
-    return _adjusted(PreparedCapture(source), frame, issues, align=True, colours=True).changes
+    prepared = _adjusted(PreparedCapture(source), frame, issues, align=True, colours=True)
+    return replace(prepared, loose_masks=find_loose_masks(frame)).changes
 
 
 def _adjusted(

@@ -50,17 +50,27 @@ class CaptureScene(LeaveOneOutScene):
     """Whether a common shift of all images is undone (`prepare`)."""
     match_colours: bool = True
     """Whether the cameras' colours are matched (`prepare`)."""
+    tighten_masks: bool = True
+    """Whether loose masks of the input cameras are tightened (`prepare`)."""
 
     @property
     def definition(self) -> str:
-        """The capture's fingerprint, which cameras, how many frames, and what is not prepared."""
-        raw = [name for name in ("align", "match_colours") if not getattr(self, name)]
-        return repr((self.fingerprint, self.held, self.inputs, self.count, *raw))
+        """The capture's fingerprint, which cameras, how many frames, and how they are prepared."""
+        prepared = [name for name in ("align", "match_colours") if not getattr(self, name)]
+        if self.tighten_masks:
+            prepared.append("tighten_masks")
+        return repr((self.fingerprint, self.held, self.inputs, self.count, *prepared))
 
     def frames(self) -> Iterator[LeaveOneOutFrame]:
         """Frames with a subject in which the camera that was left out, and at least two of the inputs, have images."""
         opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.format)
-        capture = prepare(opened, self.inputs, align=self.align, match_colours=self.match_colours)
+        capture = prepare(
+            opened,
+            self.inputs,
+            align=self.align,
+            match_colours=self.match_colours,
+            tighten_masks=self.tighten_masks,
+        )
         for time in range(self.count):
             frame = capture.read(time)
             if self.held in frame.cameras.names and len(frame.cameras) >= 3 and frame.has_subject:

@@ -159,7 +159,9 @@ class CaptureRigs:
         def cameras(held: str) -> Cameras:
             if (which, held) not in self._prepared:  # aligned when this camera is first held out
                 others = [n for n in capture.cameras.names if n != held and (own is None or n != own.camera)]
-                self._prepared[which, held] = prepare(capture, others, match_colours=False)
+                self._prepared[which, held] = prepare(
+                    capture, others, match_colours=False, tighten_masks=False
+                )
             return replace(self._prepared[which, held], max_image_size=size_px).cameras
 
         return Scene(LeaveOneOut(frames, capture.bounds, cameras), random, held_out)
@@ -193,7 +195,10 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
         return studio
     opened = [own for folder in folders for own in open_training_captures(folder, config.hold_out)]
     # Only for its checks: each held-out camera has its own alignment.
-    captures = [(prepare(own.source, align=False, match_colours=False), own.left_out) for own in opened]
+    captures = [
+        (prepare(own.source, align=False, match_colours=False, tighten_masks=False), own.left_out)
+        for own in opened
+    ]
     back = [own.held_back for own in opened]
     return MixedRigs(
         CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed

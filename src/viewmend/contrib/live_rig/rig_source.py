@@ -67,6 +67,7 @@ class RigFileSource(LiveSource):
         max_image_size: int | None = None,
         align: bool = True,
         match_colours: bool = True,
+        tighten_masks: bool = True,
     ) -> None:
         """Read the rig; its cameras are opened by `start`.
 
@@ -79,6 +80,7 @@ class RigFileSource(LiveSource):
         self._max_image_size = max_image_size
         self._align = align
         self._match_colours = match_colours
+        self._tighten_masks = tighten_masks
         self._lock_cameras = threading.Condition()
         self._playback = Playback()
         self._aligner = Aligner((), 1.0, 1.0, 1.0)
@@ -233,7 +235,12 @@ class RigFileSource(LiveSource):
         capture = MemoryCapture(
             self.rig.name, self._cameras, (frame,), bounds=self.rig.bounds, up=self.rig.up
         )
-        prepared = prepare(capture, align=self._align, match_colours=self._match_colours)
+        prepared = prepare(
+            capture,
+            align=self._align,
+            match_colours=self._match_colours,
+            tighten_masks=self._tighten_masks,
+        )
         for change in prepared.changes:
             log.warning("%s", change)
         return prepared
