@@ -14,6 +14,7 @@ from viewmend.models.views.grid import (
     CELL_PX,
     TILE_PX,
     UNet,
+    band_sides_px,
     detail_bands,
     downsample2x,
     index_image,
@@ -43,6 +44,26 @@ def test_detail_is_what_pixels_have_around_weighted_local_means(grad, rng):
             means.append((weight[near, None, None] * colours[near]).sum(0) / weight[near].sum())
         expected = torch.stack([colours[n] - means[0], means[0] - means[1]])
         assert torch.allclose(bands[n], expected, atol=1e-5), (row, column)
+
+
+def test_magnified_images_have_the_magnified_detail(rng):
+    """Nine pixels for one of the cameras: at their centres, the detail is that of the camera's own pixels."""
+    colours = torch.rand(8 * 11, 1, 3, generator=rng)
+    weight = 0.01 + torch.rand(8 * 11, generator=rng)
+    small = torch.Size((8, 11))
+    bands = detail_bands(colours, weight, torch.nonzero(torch.ones(small)), small)
+    large = torch.Size((24, 33))
+    pixels = torch.nonzero(torch.ones(large))
+    source = (pixels[:, 0] // 3) * 11 + pixels[:, 1] // 3
+    magnified = detail_bands(colours[source], weight[source], pixels, large, magnification=3.0)
+    centres = ((pixels % 3) == 1).all(1)
+    assert torch.allclose(magnified[centres], bands, atol=1e-5)
+
+
+def test_squares_of_detail_grow_with_the_magnification():
+    assert band_sides_px(0.4) == band_sides_px(1.0) == band_sides_px(1.25) == BAND_PX == (3, 7)
+    assert [band_sides_px(factor) for factor in (2.0, 3.0, 6.1)] == [(5, 13), (9, 21), (17, 41)]
+    assert band_sides_px(100.0) == band_sides_px(8.0)
 
 
 def test_a_downsampled_view_has_the_means_of_covered_pixels(scene):

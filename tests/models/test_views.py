@@ -9,7 +9,7 @@ from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider, RenderQuality, State
 from viewmend.models.views import model, prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
-from viewmend.models.views.grid import scatter_to_image
+from viewmend.models.views.grid import detail_bands, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.prediction import remains_of_phantoms
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
@@ -53,6 +53,24 @@ def test_soft_e_blends(scene):
     torch.testing.assert_close(half.rgb, (whole.rgb + view.rgb) / 2)
     torch.testing.assert_close(half.alpha, (whole.alpha + view.mask) / 2)
     assert none.rgb is view.rgb and none.alpha is None
+
+
+@torch.no_grad()
+def test_detail_of_a_magnified_view_follows_the_source_cameras(scene, monkeypatch):
+    """A camera of three times the pixels in each direction: detail is added at three times the scale."""
+    stream = scene[0]
+    stored = stream.cached_frame().frame.cameras[0]
+    width, height = stored.max_size_px
+    found = []
+
+    def record(*arguments):
+        found.append(arguments[-1])
+        return detail_bands(*arguments)
+
+    monkeypatch.setattr(model, "detail_bands", record)
+    for factor in (1, 3):
+        stream.view(stored.resized(factor * width, factor * height))
+    assert found == pytest.approx([1, 3], rel=0.15)
 
 
 @torch.no_grad()

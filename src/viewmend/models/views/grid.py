@@ -22,7 +22,10 @@ TILE_PX = 32
 AT_ONCE = (8, 4, 2, 1)
 """Tiles pass the layers in groups of these sizes: a few sizes, because convolutions are compiled for each."""
 BAND_PX = (3, 7)
-"""Means over squares of these sides, pixels, separate the bands of detail."""
+"""Means over squares of these sides separate the bands of detail, pixels of a view that shows the
+subject as large as the source cameras do."""
+MAX_MAGNIFICATION = 8.0
+"""The squares grow with a view's magnification up to this factor."""
 WIDER = 16
 """The U-Net adds this many channels at each coarser scale."""
 
@@ -93,27 +96,41 @@ def scatter_to_image(
 
 
 def detail_bands(
-    colours: Float[Tensor, "pixel image 3"], weight: Float[Tensor, "pixel"], pixels: Pixels, shape: torch.Size
+    colours: Float[Tensor, "pixel image 3"],
+    weight: Float[Tensor, "pixel"],
+    pixels: Pixels,
+    shape: torch.Size,
+    magnification: float = 1.0,
 ) -> Float[Tensor, "pixel band image 3"]:
     """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
+
+    Bands follow the sampling of the source cameras. In a magnified view, what differs from its mean over three pixels
+    is mostly where neighbouring pixels were sampled in different cameras: added as detail, it would show as specks.
 
     Args:
         colours: the images' colours at the pixels.
         weight: weight of each pixel in the means, above 0.
         pixels: row and column of each pixel.
         shape: height and width of the images.
+        magnification: of the images, relative to the source cameras (`SourceCameras.magnification`).
     """
     count = colours.shape[1]
     weighted = (weight[:, None, None] * colours).flatten(1)
     image = scatter_to_image(torch.cat([weighted, weight[:, None]], 1), pixels, shape)
     finer = colours
     bands = []
-    for side in BAND_PX:
+    for side in band_sides_px(magnification):
         sums = _box_means_at(image, side, pixels)
         mean = (sums[:, :-1] / sums[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
         bands.append(finer - mean)
         finer = mean
     return torch.stack(bands, 1)
+
+
+def band_sides_px(magnification: float) -> tuple[int, ...]:
+    """The sides of the squares around whose means there is detail: the largest odd numbers of pixels that fit."""
+    factor = min(max(magnification, 1.0), MAX_MAGNIFICATION)
+    return tuple(2 * int((factor * side - 1) / 2) + 1 for side in BAND_PX)
 
 
 def _box_means_at(

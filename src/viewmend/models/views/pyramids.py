@@ -124,14 +124,19 @@ def choose_levels(
         step_px: distance of rays in the novel view.
         scale: the scale of the novel view.
     """
+    footprint_px = step_px * pixel_footprints(cameras, viewer, scale)
+    fine = torch.minimum(_level_of(footprint_px), last)
+    wide = torch.minimum(_level_of(AROUND * subject_px), last)
+    return fine, torch.maximum(fine, wide)
+
+
+def pixel_footprints(cameras: Cameras, viewer: Cameras, scale: SceneScale) -> Float[Tensor, "view"]:
+    """Size of a novel view's pixel at the subject in each source camera, in pixels of its image."""
     pose = viewer.world_from_camera[0].double()
     depth_m = torch.as_tensor(scale.depth_m, dtype=torch.double)
     subject_center = pose[:3, 3] + depth_m * pose[:3, 2]
     distance_m = (cameras.centers - subject_center).square().sum(-1).sqrt().clamp_min(1e-6)
-    footprint_px = step_px * depth_m / viewer.K[0, 0, 0] * cameras.K[:, 0, 0] / distance_m
-    fine = torch.minimum(_level_of(footprint_px), last)
-    wide = torch.minimum(_level_of(AROUND * subject_px), last)
-    return fine, torch.maximum(fine, wide)
+    return depth_m / viewer.K[0, 0, 0] * cameras.K[:, 0, 0] / distance_m
 
 
 def _level_of(pixel_size: Float[Tensor, "view"]) -> Levels:
@@ -238,6 +243,13 @@ class SourceCameras:
             fine, wide = zip(*levels, strict=True)
             found += [MipLevels.of(pyramids, fine), MipLevels.of(pyramids, wide)]
         return found
+
+    def magnification(self, viewer: Cameras, scale: SceneScale) -> float:
+        """How many pixels of the novel view a pixel of the sharpest source camera fills along a side, at least 1."""
+        if torch.compiler.is_exporting():
+            return 1.0
+        largest = float(pixel_footprints(self.cameras.on_host, viewer.on_host, scale).amax())
+        return max(1.0, 1 / max(largest, 1e-6))
 
     @property
     def _parts(self) -> list[tuple[Cameras, tuple[Pyramid, ...]]]:
