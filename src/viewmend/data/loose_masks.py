@@ -43,14 +43,15 @@ MIN_FILLED = 0.02
 NOISE = 8.0
 """Standard deviation of a pixel's colour around the mean nearby, of 255, in addition to the measured one."""
 MIN_CONTRAST = 1.0
-"""Subject and background are told apart if the squared distance of their colours is above this, in variances."""
+"""The squared distance of the colours of subject and background from which a pixel counts, in
+variances."""
 FULL_CONTRAST = 9.0
-"""From this squared distance on, a pixel counts fully."""
+"""The squared distance from which a pixel counts fully, in variances."""
 MIN_EVIDENCE = 0.25
 """A camera is measured if its outline's pixels count at least this much on average."""
 TIGHT_PX = 1.15
-"""In an exact mask, the subject's share passes one half at this distance, pixels: those at the edge
-have the distance 1."""
+"""The distance at which the subject's share passes one half in an exact mask, pixels: those at its
+edge have the distance 1."""
 MIN_LOOSE_PX = 0.4
 """Masks that are looser than this are tightened, pixels of the reduced image. Exact masks of studio
 scenes are measured to within 0.1."""
@@ -58,7 +59,7 @@ scenes are measured to within 0.1."""
 
 @dataclass(frozen=True)
 class LooseMasks:
-    """By how much the masks of some cameras are too wide."""
+    """The widths by which the masks of some cameras are too wide."""
 
     names: tuple[str, ...]
     """The cameras whose masks are loose."""
@@ -70,8 +71,9 @@ class LooseMasks:
     @property
     def summary(self) -> str:
         """What was changed, for the user."""
-        low, high = min(self.widths_px), max(self.widths_px)
-        width = f"{low:.1f}" if f"{low:.1f}" == f"{high:.1f}" else f"{low:.1f} to {high:.1f}"
+        low = f"{min(self.widths_px):.1f}"
+        high = f"{max(self.widths_px):.1f}"
+        width = low if low == high else f"{low} to {high}"
         count = len(self.names)
         return (
             f"masks of {count} camera{'s' if count > 1 else ''} extend {width} pixels beyond the subject, judging by "
@@ -145,7 +147,7 @@ class _Outline(NamedTuple):
     """The pixels of a mask between its edge and what is surely subject."""
 
     distance_px: Float[np.ndarray, "pixel"]
-    """From the nearest pixel outside the mask."""
+    """Distance from the nearest pixel outside the mask."""
     share: Float[np.ndarray, "pixel"]
     """The subject's share of the pixel, by its colour, in [0, 1]."""
     evidence: Float[np.ndarray, "pixel"]
