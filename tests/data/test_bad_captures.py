@@ -148,7 +148,10 @@ BAD = {
         remove("images/a_001.png", "images/b_001.png", "masks/c_001.png", "masks/d_001.png"),
         ["a_001.png", "frame '001'", "image and mask of the same camera"],
     ),
-    "mask of some": (camera(mask=None), [FILE, B, "'mask' for every camera or for none"]),
+    "mask of one": (
+        lambda p: p.edit(lambda d: [d["cameras"][n].pop("mask") for n in (1, 2, 3)]),
+        [FILE, B, "'mask' for every camera or for none"],
+    ),
     "depth of some": (camera(depth="masks/b_000.png"), [FILE, "camera 'a'", "'depth' for every camera"]),
     "image cut short": (cut("images/b_000.png"), ["images/b_000.png", B, "frame '000'", "truncated"]),
     "image is text": (write("images/b_000.png", b"hello"), ["images/b_000.png", B, "frame '000'", "5 bytes"]),
@@ -209,3 +212,14 @@ def test_a_frame_without_masks_of_a_format_that_lists_no_frames(tmp_path):
         (tmp_path / f"masks/{name}/000001.png").unlink()
     with pytest.raises(CaptureError, match=r"masks/1/000001.*no mask of any.*or remove the frame's images$"):
         open_capture(tmp_path)
+
+
+def test_a_camera_without_masks_is_not_used_and_named_once(plain, capsys, caplog):
+    plain.edit(lambda d: d["cameras"][1].pop("mask"))
+    capture = open_capture(plain.path)
+    assert capture.unmasked == ("b",) and capture.cameras.names == ("a", "c", "d")
+    assert capture.read(0).cameras.names == ("a", "c", "d") and not capture.gaps
+    assert "camera 'b': expected masks as the other cameras have, got none" in caplog.text
+    assert main(["check", str(plain.path)]) == 0
+    assert capsys.readouterr().out.count("'b'") == 1
+    assert open_capture(plain.path, masks="none").cameras.names == ("a", "b", "c", "d")

@@ -11,12 +11,19 @@ import tyro
 if TYPE_CHECKING:
     from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.checks.calibration import CalibrationCheck
+    from viewmend.data.errors import Issue
     from viewmend.types import MultiViewFrame
 
 FEW_CAMERAS = 6
 """Artefacts are expected with fewer cameras."""
 WIDE_DEG = 60.0
 """Artefacts are expected if neighbouring cameras are farther apart than this angle, degrees."""
+ADVISED_DEG = 45
+"""Rigs with wider angles are advised to place neighbouring cameras this far apart, degrees."""
+MIN_RIG_M = 0.05
+"""Rigs whose longest side is shorter than this, metres, have the wrong unit."""
+MAX_RIG_M = 500.0
+"""Rigs whose longest side is longer than this, metres, have the wrong unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +79,9 @@ def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, 
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
-        check = replace(check, issues=(*capture.issues, *without_consequences(check.issues, late), *late))
+        found = (*capture.issues, *without_consequences(check.issues, late), *late)
+        unit = () if any("metres_per_unit" in issue.text for issue in found) else _find_wrong_unit(capture)
+        check = replace(check, issues=(*found, *unit))
         changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good, check.issues)
     if options.out is not None:
         remove_partial_file(options.out)
@@ -80,6 +89,18 @@ def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, 
             write_image(options.out, draw_check(check, capture.up))
         say(f"wrote {options.out}")
     return capture, check, changes
+
+
+def _find_wrong_unit(capture: "CaptureFolder") -> "tuple[Issue, ...]":
+    """A rig whose size cannot be in metres."""
+    from viewmend.data.errors import Issue
+
+    centers = capture.cameras.centers
+    size_m = float((centers.amax(0) - centers.amin(0)).max())
+    if MIN_RIG_M <= size_m <= MAX_RIG_M:
+        return ()
+    expected = f"a rig of {MIN_RIG_M} to {MAX_RIG_M:g} m"
+    return (Issue(f"expected {expected}, got one of {size_m:.3g} m; check metres_per_unit"),)
 
 
 def _frame(capture: "CaptureFolder", options: Options) -> "MultiViewFrame":
@@ -131,6 +152,8 @@ def describe_capture(capture: "CaptureFolder", check: "CalibrationCheck") -> dic
         "hull_iou_mean": sum(iou) / len(iou) if iou else None,
         "hull_iou_min": min(iou, default=None),
         "cameras": [_describe_camera(capture, check, view) for view in range(len(cameras))],
+        "left_out": [issue.camera for issue in check.issues if issue.camera],
+        "unused": list(capture.unmasked),
         "findings": [issue.text for issue in check.issues],
     }
 
@@ -181,11 +204,7 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         f"  bounds    {'none' if bounds is None else f'{_vector(bounds[0])} to {_vector(bounds[1])}'}",
         f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",
     ]
-    few = len(capture["cameras"]) < FEW_CAMERAS or capture["camera_spacing_deg"] > WIDE_DEG
-    expected = "; expect foggy bodies and doubled limbs; 8 or more cameras, 45 degrees apart, avoid them"
-    lines.append(
-        f"  angles    {capture['camera_spacing_deg']:.0f} degrees between neighbours{expected if few else ''}"
-    )
+    lines.append(f"  angles    {_angles_as_text(capture)}")
     if iou is not None:
         subject = capture["subject_extent_m"]
         extent = "none: the masks have no point in common" if subject is None else _extent(subject)
@@ -195,6 +214,7 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
     width = max(len(camera["name"]) for camera in capture["cameras"])
     for camera in capture["cameras"]:
         iou = "" if camera["hull_iou"] is None else f"  IoU {camera['hull_iou']:.3f}"
+        iou = "  left out" if camera["name"] in capture["left_out"] else iou
         size = f"{camera['width']} x {camera['height']}"
         lens = f"{size:<12} focal {camera['focal_px'][0]:7.1f} px  {camera['fov_x_deg']:5.1f} deg wide"
         lines.append(f"  {camera['name']:<{width}}  {lens}{iou}")
@@ -209,6 +229,20 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
             *(f"  - {text}" for text in capture["adjustments"]),
         ]
     return lines
+
+
+def _angles_as_text(capture: dict[str, Any]) -> str:
+    """The angle between neighbouring cameras, and advice to rigs of few or widely spaced ones."""
+    used = len(capture["cameras"]) - len(capture["left_out"])
+    spacing_deg = capture["camera_spacing_deg"]
+    text = f"{spacing_deg:.0f} degrees between neighbours"
+    if spacing_deg > WIDE_DEG:
+        advice = f"neighbours at most {ADVISED_DEG} degrees apart avoid them"
+    elif used < FEW_CAMERAS:
+        advice = f"{used} cameras see it from few sides: more cameras, on the other sides, avoid them"
+    else:
+        return text
+    return f"{text}; expect foggy bodies and doubled limbs; {advice}"
 
 
 def _film_as_text(film: dict[str, Any]) -> str:

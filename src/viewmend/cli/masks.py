@@ -1,5 +1,6 @@
 """`viewmend masks`: masks for a capture that has none."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -60,11 +61,16 @@ def run(options: Options) -> int:
 
     _check(options)
     alpha = options.method == "alpha"
-    capture = open_capture(options.source, options.cameras or None, options.format, alpha=alpha)
+    masks = "alpha" if alpha else "none"
+    capture = open_capture(options.source, options.cameras or None, options.format, masks=masks)
     part = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)))
-    source = part if alpha else _masked(options, capture, part)
+    masked = None if alpha else _masked(options, capture, part)
     empty = write_capture(
-        source, options.out, images=options.images, progress=lambda times: track(times, "masks")
+        masked or part,
+        options.out,
+        images=options.images,
+        progress=lambda times: track(times, "masks"),
+        unmasked=masked and masked.unmasked,
     )
     if len(empty) == len(part.frame_ids):
         got = f"none in {len(empty)} frame{'s' if len(empty) > 1 else ''}"
@@ -73,9 +79,45 @@ def run(options: Options) -> int:
         )
     if empty:
         say(f"{without_subject(part, empty, len(part.frame_ids))}; their masks are empty")
-    say(f"{options.out}: masks of {len(part.cameras)} cameras, {len(part.frame_ids)} frames; check them with")
+    for text in [] if masked is None else _describe_notes(masked):
+        say(text)
+    frames = len(part.frame_ids)
+    bare = [] if masked is None else [n for n, times in masked.notes.without.items() if len(times) == frames]
+    cameras = len(part.cameras) - len(bare)
+    say(
+        f"{options.out}: masks of {cameras} cameras, {frames} frame{'s' if frames > 1 else ''}; check them with"
+    )
     say(f"  viewmend check {options.out} --out check.png")
     return 0
+
+
+def _describe_notes(masked: "MaskedCapture") -> list[str]:
+    """Lines that say what comparing the cameras has changed; cameras with equal changes share one."""
+    notes = masked.notes
+    ids = masked.frame_ids
+    alike: dict[tuple[str, str], list[str]] = {}
+
+    def note(name: str, times: Iterable[int], text: str) -> None:
+        first, *rest = sorted(times)
+        where = f" in {len(rest) + 1} of {len(ids)} frames, the first '{ids[first]}'" if len(ids) > 1 else ""
+        alike.setdefault((where, text), []).append(f"'{name}'")
+
+    for name, times in notes.remade.items():
+        note(
+            name,
+            times,
+            "no person detected, or not the one that the other cameras see; segmented where these see one",
+        )
+    for name, kept_at in notes.bystanders.items():
+        x, y = kept_at[min(kept_at)]
+        note(name, kept_at, f"several people; kept the one at ({x}, {y}) px, which the other cameras see too")
+    for name, causes in notes.without.items():
+        note(name, causes, f"{causes[min(causes)]}; written without a mask, and not used")
+    texts = [f"{', '.join(names)}{where}: {text}" for (where, text), names in alike.items()]
+    if notes.several:
+        count = f"{len(notes.several)} of {len(ids)} frames"
+        texts.append(f"{count} have several people that most cameras see; all of them are kept")
+    return texts
 
 
 def _check(options: Options) -> None:
@@ -104,7 +146,7 @@ def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture"
     from viewmend.preprocess.masks.maker import KEYS, ChromaMasks
     from viewmend.preprocess.masks.masked import MaskedCapture
     from viewmend.preprocess.masks.network import NetworkMasks
-    from viewmend.preprocess.masks.person import PersonMasks
+    from viewmend.preprocess.masks.person import PersonMasks, mask_near
     from viewmend.preprocess.masks.plate import PlateMasks, plates_from_files, plates_from_frames
 
     names = capture.cameras.names
@@ -114,9 +156,8 @@ def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture"
     elif options.plate_frames is not None:
         plates = plates_from_frames(capture, chosen_times(options.plate_frames, len(capture.frame_ids)))
     if options.method == "person":
-        return MaskedCapture(
-            part, {name: PersonMasks() for name in names}, "none" if options.no_clean else "parts"
-        )
+        makers = {name: PersonMasks() for name in names}
+        return MaskedCapture(part, makers, "none" if options.no_clean else "parts", mask_near=mask_near)
     if options.method == "onnx":
         assert options.network is not None
         makers = {name: NetworkMasks(options.network, plates.get(name)) for name in names}

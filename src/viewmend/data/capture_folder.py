@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -38,9 +39,16 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rigid import rigid
 from viewmend.types import MultiViewFrame
 
+MaskSource = Literal["files", "alpha", "none"]
+"""Where a capture's masks come from: its own files, the alpha channel of its images, or nowhere."""
+
 
 def open_capture(
-    path: Path | str, cameras: Sequence[str] | None = None, format: str | None = None, *, alpha: bool = False
+    path: Path | str,
+    cameras: Sequence[str] | None = None,
+    format: str | None = None,
+    *,
+    masks: MaskSource = "files",
 ) -> "CaptureFolder":
     """Open a capture folder of any supported format (docs/formats.md).
 
@@ -48,7 +56,7 @@ def open_capture(
         path: the folder, or the file that stands for it, such as `cameras.json`.
         cameras: names of the cameras to use; all by default.
         format: name of the format; by default it is recognised.
-        alpha: use the alpha channel of the images as masks.
+        masks: use the capture's own mask files, the alpha channel of its images, or no masks.
 
     Raises:
         CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see
@@ -68,7 +76,7 @@ def open_capture(
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 64, 64])
     """
-    capture = CaptureFolder(Path(path), cameras, format, alpha)
+    capture = CaptureFolder(Path(path), cameras, format, masks)
     for issue in capture.issues:
         logging.getLogger("viewmend").warning("%s: %s", capture.name, issue.text)
     return capture
@@ -93,7 +101,11 @@ class CaptureFolder:
     """
 
     def __init__(
-        self, path: Path, cameras: Sequence[str] | None = None, format: str | None = None, alpha: bool = False
+        self,
+        path: Path,
+        cameras: Sequence[str] | None = None,
+        format: str | None = None,
+        masks: MaskSource = "files",
     ):
         path = path.parent if path.name == CALIBRATION and path.is_file() else path
         calibration = read_any_calibration(path, format)
@@ -102,8 +114,13 @@ class CaptureFolder:
         """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
         self._entries = _select(calibration.cameras, cameras, self._file)
-        if alpha:
+        if masks == "alpha":
             self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
+        elif masks == "none":
+            self._entries = tuple(replace(camera, mask=None) for camera in self._entries)
+        self.unmasked = _without_masks(self._entries)
+        """Cameras that are not used, because they have no masks and others do."""
+        self._entries = tuple(camera for camera in self._entries if camera.name not in self.unmasked)
         self.cameras = pinhole_cameras(self._entries)
         self.clock = read_clock(calibration)
         """When the films' frames were taken; None for a capture of images."""
@@ -138,16 +155,25 @@ class CaptureFolder:
 
     @property
     def issues(self) -> tuple[Issue, ...]:
-        """Films whose times differ from the others'."""
+        """Cameras without masks, and films whose times differ from the others'."""
+        unused = ()
+        if self.unmasked:
+            names = ", ".join(f"'{name}'" for name in self.unmasked)
+            who, use = ("cameras", "they are") if len(self.unmasked) > 1 else ("camera", "it is")
+            unused = (
+                Issue(
+                    f"{who} {names}: expected masks as the other cameras have, got none, so {use} not used"
+                ),
+            )
         if self.clock is None:
-            return ()
+            return unused
         listed = self._listed
         found = len(self.frame_ids)
         text = (
             f"expected {listed} frames as listed, got videos with {found} common times; "
             "the other frames are left out"
         )
-        return ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
+        return unused + ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
 
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
@@ -286,6 +312,12 @@ def _select(
             f"{file}: expected cameras among {list(by_name)}, each once, got {list(names)}; choose again"
         )
     return tuple(by_name[name] for name in names)
+
+
+def _without_masks(cameras: Sequence[NativeCamera]) -> tuple[str, ...]:
+    """The cameras without masks, if at least two others have some."""
+    unmasked = tuple(camera.name for camera in cameras if camera.mask is None)
+    return unmasked if len(cameras) - len(unmasked) >= 2 else ()
 
 
 def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:

@@ -36,6 +36,7 @@ def write_capture(
     *,
     images: Literal["jpeg", "png"] = "jpeg",
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+    unmasked: Callable[[int], MultiViewFrame | None] | None = None,
 ) -> tuple[int, ...]:
     """Write all frames of a source to the folder `out`: images, masks and depth if present, and `cameras.json`.
 
@@ -49,6 +50,8 @@ def write_capture(
         out: a new or empty folder.
         images: the format of the camera images.
         progress: wraps the frame indices while they are iterated over, as a progress bar does.
+        unmasked: returns the cameras of a frame, by its index, that the frame lacks because they
+            have no mask. Their images are written.
 
     Raises:
         CaptureError: `out` exists and is not empty, or the source cannot be read.
@@ -66,7 +69,7 @@ def write_capture(
     with atomic_folder(out) as unfinished:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")
         times = range(len(source.frame_ids))
-        return writer.write(times if progress is None else progress(times))
+        return writer.write(times if progress is None else progress(times), unmasked)
 
 
 @contextmanager
@@ -109,6 +112,7 @@ class _Writer:
         self.folder = folder
         self.suffix = suffix
         self.kinds: set[FileKind] = {"image"}
+        self.masked: set[str] = set()
         names = source.cameras.names
         self.folder_names = {name: _folder_name(name, index) for index, name in enumerate(names)}
         if len({name.lower() for name in self.folder_names.values()}) < len(names):
@@ -119,16 +123,20 @@ class _Writer:
             raise CaptureError(f"{source.name}: expected {expected}, got {unsafe}; rename the frames")
         folder.mkdir()
 
-    def write(self, times: Iterable[int]) -> tuple[int, ...]:
-        """Write these frames; the return value is that of `write_capture`."""
+    def write(
+        self, times: Iterable[int], unmasked: Callable[[int], MultiViewFrame | None] | None = None
+    ) -> tuple[int, ...]:
+        """Write these frames; arguments and return value are those of `write_capture`."""
         empty = []
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             for frame in prefetch(self.source, times):
-                list(
-                    pool.map(
-                        lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))
+                rest = None if unmasked is None else unmasked(frame.time)
+                for part in (frame,) if rest is None else (frame, rest):
+                    list(
+                        pool.map(
+                            lambda view, part=part: self._write_view(part, view), range(len(part.cameras))
+                        )
                     )
-                )
                 empty += [frame.time] if frame.mask is not None and not frame.has_subject else []
         write_calibration(self.folder, self._calibration())
         return tuple(empty)
@@ -146,6 +154,7 @@ class _Writer:
             file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
         )
         if frame.mask is not None:
+            self.masked.add(name)
             write_image(file("mask"), frame.mask[view, :height, :width].contiguous().cpu().numpy())
         if frame.depth is not None:
             write_depth(file("depth"), frame.depth[view, :height, :width].float().contiguous().cpu().numpy())
@@ -163,7 +172,8 @@ class _Writer:
         for view, (name, (width, height)) in enumerate(
             zip(cameras.names, cameras.size_px.tolist(), strict=True)
         ):
-            files: Any = {kind: self._path(name, kind) if kind in self.kinds else None for kind in FILE_KINDS}
+            kinds = self.kinds if name in self.masked else self.kinds - {"mask"}
+            files: Any = {kind: self._path(name, kind) if kind in kinds else None for kind in FILE_KINDS}
             R = pose[view, :3, :3]
             t_m = pose[view, :3, 3]
             entries.append(NativeCamera(name, width, height, K[view], R, t_m, np.zeros(5), **files))

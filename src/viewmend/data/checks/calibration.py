@@ -51,30 +51,48 @@ class CalibrationCheck:
     silhouettes: Float[Tensor, "view height width"] | None
     """1 where the hull covers a pixel."""
     iou: dict[str, float]
-    """Intersection over union of silhouette and mask of each camera; empty without masks."""
+    """Intersection over union of silhouette and mask of each camera that is not left out; empty
+    without masks."""
     issues: tuple[Issue, ...] = ()
 
 
 def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> CalibrationCheck:
-    """The hull of a frame compared with the masks; `bounds` are those of the capture. ValueError without a hull."""
+    """The hull of a frame compared with the masks; `bounds` are those of the capture.
+
+    Cameras that the diagnosis leaves out do not carve the hull.
+
+    Raises:
+        ValueError: there is one camera only, or the cameras look away from each other.
+    """
     if frame.mask is None:
         return CalibrationCheck(frame, bounds or bounds_from_cameras(frame.cameras), None, None, {})
-    proxy = reconstruct(frame.mask, frame.cameras, bounds)
+    issues = diagnose(frame, bounds)
+    good = frame.without([issue.camera for issue in issues if issue.camera])
+    good = good if len(good.cameras) >= 2 else frame
+    assert good.mask is not None
+    proxy = reconstruct(good.mask, good.cameras, bounds)
     covered = proxy.depth(frame.cameras) > 0
     iou = silhouette_iou(covered, frame.mask).nan_to_num(1.0).tolist()  # two empty silhouettes agree
-    scores = dict(zip(frame.cameras.names, iou, strict=True))
-    return CalibrationCheck(
-        frame, bounds or proxy.bounds, proxy, covered.float(), scores, diagnose(frame, bounds)
-    )
+    scores = {
+        name: one for name, one in zip(frame.cameras.names, iou, strict=True) if name in good.cameras.names
+    }
+    return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores, issues)
 
 
 def draw_check(check: CalibrationCheck, up: Point | None, tile_width: int = 400) -> Picture:
     """Draw all cameras with bounds, axes, up, and the disagreement of hull and mask; see `LEGEND`."""
     names = check.frame.cameras.names
-    captions = [f"{name}   IoU {check.iou[name]:.3f}" if name in check.iou else name for name in names]
+    captions = [f"{name}   {_caption(check, name)}" for name in names]
     tiles = [Tile(caption, _draw(check, view, up)) for view, caption in enumerate(captions)]
     sheet = contact_sheet(in_rows(tiles, math.ceil(math.sqrt(1.25 * len(tiles)))), tile_width)
     return np.concatenate([sheet, contact_sheet([[Tile(LEGEND, None)]], sheet.shape[1] - 8, tile_height=0)])
+
+
+def _caption(check: CalibrationCheck, name: str) -> str:
+    """A camera's agreement with the hull, if there is one."""
+    if not check.iou:
+        return ""
+    return f"IoU {check.iou[name]:.3f}" if name in check.iou else "left out"
 
 
 def _draw(check: CalibrationCheck, view: int, up: Point | None) -> Picture:

@@ -7,23 +7,25 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
-from torch import Tensor
 
-from viewmend.data.source import CaptureSource, CaptureWrapper, scale_cameras
+from viewmend.data.source import CaptureSource, CaptureWrapper
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import reconstruct
+from viewmend.preprocess.masks.consensus import (
+    MaskNear,
+    Masks,
+    Settled,
+    cut,
+    put,
+    reduced,
+    settle_masks,
+    widened,
+)
 from viewmend.preprocess.masks.maker import Inside, Mask, MaskMaker, Rgb, lasting, without_spill
 from viewmend.types import MultiViewFrame
 
-Masks = UInt8[Tensor, "view height width"]
-
-CARVED_PX = 480
-"""Silhouettes are compared in images of this longer side."""
-MARGIN_PX = 4
-"""Dilation of silhouettes and hulls, for inexact calibration and voxels."""
 GAP = 1 / 24
 """Gaps of a mask up to this share of the image's longer side are filled where the other cameras
 support it."""
@@ -43,7 +45,7 @@ def agreed(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
     cleaned = mask.clone()
     for view, votes in enumerate(_votes(mask, cameras, bounds)):
         if votes is not None:
-            _put(cleaned, view, _judged(_cut(mask, cameras, view), *votes))
+            put(cleaned, view, _judged(cut(mask, cameras, view), *votes))
     return cleaned
 
 
@@ -52,7 +54,7 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
 
     None without a hull.
     """
-    small, small_cameras = _reduced(mask, cameras)
+    small, small_cameras = reduced(mask, cameras)
     there = [view for view in range(len(cameras)) if bool((small[view] > FOREGROUND).any())]
     for view, size_px in enumerate(cameras.size_px.tolist()):
         others = [other for other in there if other != view]
@@ -62,7 +64,7 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
             hull = reconstruct(small[group], small_cameras[group], bounds)
             seen.append(hull.depth(small_cameras[view])[0].numpy() > 0)
         if any(one.any() for one in seen):
-            votes = (_widened(np.any(seen, 0)), np.all(seen, 0))
+            votes = (widened(np.any(seen, 0)), np.all(seen, 0))
             some, all_ = (np.asarray(cv2.resize(vote.astype(np.float32), size_px)) > 0.5 for vote in votes)
             yield some, all_
         else:
@@ -77,25 +79,32 @@ def _judged(own: Mask, some: Inside, all_: Inside) -> Mask:
     return np.where(all_, np.maximum(kept, around), kept).astype(np.uint8)
 
 
-def _reduced(mask: Masks, cameras: Cameras) -> tuple[UInt8[Tensor, "view small_height small_width"], Cameras]:
-    """Masks and cameras at the size that they are compared in, silhouettes widened."""
-    small = scale_cameras(cameras, min(1.0, CARVED_PX / int(cameras.size_px.max())))
-    width, height = small.max_size_px
-    masks = torch.zeros(len(mask), height, width, dtype=torch.uint8)
-    for view, size_px in enumerate(small.size_px.tolist()):
-        own = np.asarray(cv2.resize(_cut(mask, cameras, view), size_px, interpolation=cv2.INTER_AREA))
-        _put(masks, view, 255 * _widened(own > FOREGROUND).astype(np.uint8))
-    return masks, small
-
-
-def _widened(inside: Inside) -> Inside:
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1))
-    return np.asarray(cv2.dilate(inside.astype(np.uint8), disc)) > 0
-
-
 CleanUp = Literal["none", "parts", "pixels"]
-MIN_SUPPORT = 0.2
-"""Least share of a connected part that must lie in the hull of the other cameras."""
+
+
+@dataclass
+class MaskNotes:
+    """What comparing the cameras has changed so far, as times by camera."""
+
+    without: dict[str, dict[int, str]] = field(default_factory=dict)
+    """Frames in which a camera should see the subject and has no mask, and why."""
+    remade: dict[str, set[int]] = field(default_factory=dict)
+    """Frames in which a camera's mask was made where the other cameras expect the subject."""
+    bystanders: dict[str, dict[int, tuple[int, int]]] = field(default_factory=dict)
+    """Frames in which parts of a camera's mask were dropped, and where the rest lies, pixels."""
+    several: set[int] = field(default_factory=set)
+    """Frames with several people that all cameras see."""
+
+    def add(self, time: int, settled: Settled) -> None:
+        """Add one frame."""
+        for name, cause in settled.without.items():
+            self.without.setdefault(name, {})[time] = cause
+        for name in settled.remade:
+            self.remade.setdefault(name, set()).add(time)
+        for name, center_px in settled.kept_at.items():
+            self.bystanders.setdefault(name, {})[time] = center_px
+        if settled.several:
+            self.several.add(time)
 
 
 @dataclass
@@ -111,28 +120,56 @@ class MaskedCapture(CaptureWrapper):
     screens: Mapping[str, Rgb] | None = None
     """Background behind each camera's subject, whose green or blue is removed from the outline.
     None: leave colours."""
+    mask_near: MaskNear | None = None
+    """Makes the masks of cameras that have none, or one that disagrees with all others, with the
+    clean-up "parts"."""
+    notes: MaskNotes = field(default_factory=MaskNotes)
+    """What the clean-up has changed in the frames that were read."""
     _near: dict[int, MultiViewFrame] = field(default_factory=dict)
     """Frames around the last one, with the masks of the makers."""
+    _unmasked: dict[int, MultiViewFrame] = field(default_factory=dict)
+    """Cameras without a mask in the frames that were read."""
 
     def read(self, time: int) -> MultiViewFrame:
-        """The source's frame, with masks; raises what the source and the makers do."""
+        """The source's frame, with masks; raises what the source and the makers do.
+
+        A camera that should see the subject, and of which no mask could be made, is absent.
+        """
         reach = 1 if self.clean_up == "pixels" else 0
         around = range(max(time - reach, 0), min(time + reach + 1, len(self.frame_ids)))
         self._near = {t: self._near[t] if t in self._near else self._made(t) for t in around}
         frame = self._near.get(time) or self._made(time)
-        mask = _mask_of(frame)
-        cameras = frame.cameras
-        if self.clean_up == "parts":
-            frame = replace(frame, mask=_supported_parts(mask, cameras, self.bounds))
-        elif self.clean_up == "pixels":
-            frame = replace(frame, mask=agreed(self._lasting(frame), cameras, self.bounds))
+        if self.clean_up == "pixels":
+            frame = replace(frame, mask=agreed(self._lasting(frame), frame.cameras, self.bounds))
+        if self.clean_up != "none":
+            frame = self._settled(frame)
         return frame if self.screens is None else _without_spill(frame, self.screens)
+
+    def unmasked(self, time: int) -> MultiViewFrame | None:
+        """The cameras of a frame, as last read, that should have a mask and have none; None without any."""
+        return self._unmasked.pop(time, None)
+
+    def _settled(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """The frame with compared masks, without cameras that have none."""
+        mask = _mask_of(frame)
+        images = [view_rgb(frame, view) for view in range(len(frame.cameras))]
+        settled = settle_masks(mask, images, frame.cameras, self.bounds, self.mask_near)
+        if (
+            self.clean_up == "pixels"
+        ):  # masks were compared pixel by pixel already: only empty ones are left out
+            empty = [name for name in settled.without if not _own_mask(frame, name).any()]
+            settled = Settled(mask, {name: settled.without[name] for name in empty})
+        self.notes.add(frame.time, settled)
+        if settled.without:
+            absent = [name for name in frame.cameras.names if name in settled.without]
+            self._unmasked[frame.time] = replace(frame.select(absent), mask=None)
+        return replace(frame, mask=settled.mask).without(list(settled.without))
 
     def _made(self, time: int) -> MultiViewFrame:
         frame = self.source.read(time)
         mask = torch.zeros(frame.rgb.shape[0], *frame.rgb.shape[2:], dtype=torch.uint8)
         for view, name in enumerate(frame.cameras.names):
-            _put(mask, view, self.makers[name].mask(view_rgb(frame, view)))
+            put(mask, view, self.makers[name].mask(view_rgb(frame, view)))
         return replace(frame, mask=mask)
 
     def _lasting(self, frame: MultiViewFrame) -> Masks:
@@ -142,24 +179,8 @@ class MaskedCapture(CaptureWrapper):
                 None if other is None or name not in other.cameras.names else _own_mask(other, name)
                 for other in (self._near.get(frame.time + step) for step in (-1, 1))
             )
-            _put(mask, view, lasting(_own_mask(frame, name), before, after))
+            put(mask, view, lasting(_own_mask(frame, name), before, after))
         return mask
-
-
-def _supported_parts(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
-    """The masks without connected parts that lie outside the hull of the other cameras; at least one part stays."""
-    kept = mask.clone()
-    for view, votes in enumerate(_votes(mask, cameras, bounds)):
-        own = _cut(mask, cameras, view)
-        count, found = cv2.connectedComponents((own > 0).astype(np.uint8), connectivity=8)
-        if votes is None or count <= 2:
-            continue
-        labels = np.asarray(found, np.int32)
-        weight = np.bincount(labels.ravel(), own.ravel(), count)
-        share = np.bincount(labels.ravel(), (own * votes[0]).ravel(), count) / np.maximum(weight, 1)
-        if bool((share[1:] >= MIN_SUPPORT).any()):
-            _put(kept, view, np.where((share >= MIN_SUPPORT)[labels], own, 0).astype(np.uint8))
-    return kept
 
 
 def view_rgb(frame: MultiViewFrame, view: int) -> Rgb:
@@ -183,13 +204,4 @@ def _mask_of(frame: MultiViewFrame) -> Masks:
 
 
 def _own_mask(frame: MultiViewFrame, name: str) -> Mask:
-    return _cut(_mask_of(frame), frame.cameras, frame.cameras.names.index(name))
-
-
-def _cut(mask: Masks, cameras: Cameras, view: int) -> UInt8[np.ndarray, "rows columns"]:
-    width, height = (int(side) for side in cameras.size_px[view])
-    return mask[view, :height, :width].numpy()
-
-
-def _put(mask: Masks, view: int, own: UInt8[np.ndarray, "rows columns"]) -> None:
-    mask[view, : own.shape[0], : own.shape[1]] = torch.from_numpy(own)
+    return cut(_mask_of(frame), frame.cameras, frame.cameras.names.index(name))

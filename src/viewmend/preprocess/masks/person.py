@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from viewmend.preprocess.masks.maker import Mask, Rgb
+from viewmend.preprocess.masks.maker import Inside, Mask, Rgb
 
 WEIGHTS = Path(__file__).parents[2] / "weights" / "person"
 DETECTOR_PX = 224
@@ -37,6 +37,16 @@ OUTWARD = 0.6
 two captures."""
 DETECT_EVERY = 15
 """Images after which the detector looks for further people while some are tracked."""
+GUIDED_SCORE = 0.05
+"""Least presence score of a person where the other cameras expect one."""
+GUIDED_PASSES = 2
+"""Where a person is expected, the second of these passes segments the square that the first one's
+landmarks span."""
+MIN_BETTER = 0.1
+"""Another direction fits clearly better than the first ones if its IoU with the expected silhouette
+is higher by this. Silhouettes are looser than people, so that small differences mean nothing."""
+GOOD_FIT = 0.8
+"""No further direction is tried once the mask has this IoU with the expected silhouette."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +101,47 @@ class PersonMasks:
             if not any(_same(following, other) for other in self._tracked):
                 self._tracked.append(following)
         return (255 * alpha).round().astype(np.uint8)
+
+
+def mask_near(rgb: Rgb, expected: Inside) -> Mask | None:
+    """Foreground of the person whose silhouette is about `expected`, found without the detector.
+
+    The silhouette may be larger than the person. The square around it is segmented, upright first;
+    another direction is taken where it fits clearly better. None where no person is found.
+    """
+    rows, columns = np.nonzero(expected)
+    if not len(rows):
+        return None
+    center = ((columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2)
+    radius = max(np.ptp(columns), np.ptp(rows)) / 2
+    best = None
+    best_fit = 0.0
+    for dx, dy in ((0, -1), (1, 0), (-1, 0), (0, 1)):
+        alpha = _follow(rgb, Roi.around(center, (center[0] + radius * dx, center[1] + radius * dy)))
+        fit = 0.0 if alpha is None else _fit(alpha, expected)
+        if fit > best_fit + MIN_BETTER:
+            best = alpha
+            best_fit = fit
+        if best_fit > GOOD_FIT:
+            break
+    return None if best is None else (255 * best).round().astype(np.uint8)
+
+
+def _follow(rgb: Rgb, roi: Roi) -> Float32[np.ndarray, "height width"] | None:
+    """Opacity of the person to whom the landmarks lead from a square around an expected person."""
+    alpha = None
+    for _ in range(GUIDED_PASSES):
+        found = _segment(rgb, roi, GUIDED_SCORE)
+        if found is None:
+            break
+        alpha, roi = found
+    return alpha
+
+
+def _fit(alpha: Float32[np.ndarray, "height width"], expected: Inside) -> float:
+    """IoU of a mask and the expected silhouette."""
+    inside = alpha > 0.5
+    return float((inside & expected).sum()) / max(float((inside | expected).sum()), 1.0)
 
 
 def _same(a: Roi, b: Roi) -> bool:
@@ -181,7 +232,9 @@ def _iou(a: np.ndarray, b: np.ndarray) -> float:
     return both / max(float(np.prod(a[1]) + np.prod(b[1])) - both, 1e-6)
 
 
-def _segment(rgb: Rgb, roi: Roi) -> tuple[Float32[np.ndarray, "height width"], Roi] | None:
+def _segment(
+    rgb: Rgb, roi: Roi, min_score: float = MIN_SCORE
+) -> tuple[Float32[np.ndarray, "height width"], Roi] | None:
     """Opacity of the person in a square, at the image's size, and the square for the next image; None if none there."""
     height, width = rgb.shape[:2]
     image_from_roi = roi.image_from_roi()
@@ -190,7 +243,7 @@ def _segment(rgb: Rgb, roi: Roi) -> tuple[Float32[np.ndarray, "height width"], R
         rgb, image_from_roi, (SEGMENTER_PX, SEGMENTER_PX), flags=shrink | cv2.WARP_INVERSE_MAP
     )
     landmarks, presence, logits, *_ = _run("segmenter", np.asarray(crop, np.float32) / 255)
-    if float(presence[0, 0]) < MIN_SCORE:
+    if float(presence[0, 0]) < min_score:
         return None
     opacity = 1 / (1 + np.exp(-np.clip(logits[0, :, :, 0] + OUTWARD, -30, 30)))
     # Landmarks 33 and 34 are the centre of the body and a point on the circle around it.
