@@ -25,7 +25,7 @@ from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, Stat
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import Background, composite
 from viewmend.predicted_mask import MaskPredictor
-from viewmend.scenes.held_out import Protocol, revealed
+from viewmend.scenes.held_out import Protocol, reveal
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.timing import StageTimes
@@ -104,7 +104,7 @@ class Mender(ViewSequence):
         Raises:
             ValueError: the inpainter does not return a completed view (`Inpainter.step_on`).
         """
-        target_mask, carving = revealed(self._protocol, truth)
+        target_mask, carving = reveal(self._protocol, truth)
         cached = self.add_frame(frame, carving)
         if self._masks is not None:
             target_mask = self._masks.predict(cached, target, self._exclude)

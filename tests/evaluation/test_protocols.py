@@ -16,7 +16,7 @@ from viewmend.models.paper.config import paper, paper_small
 from viewmend.models.paper.tokenizer import build_context_input, build_target_input
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig, select_closest
-from viewmend.scenes.held_out import LeaveOneOut, revealed
+from viewmend.scenes.held_out import LeaveOneOut, reveal
 from viewmend.stream import Stream
 from viewmend.training.config import SamplingConfig
 from viewmend.training.samples import HeldOutCamera
@@ -79,7 +79,7 @@ def test_a_predicted_mask_cuts_the_view_and_the_truth_is_not_looked_at():
         frame, TARGET, emptied
     )
     assert torch.equal(again.completed.rgb, step.completed.rgb)
-    assert revealed("predicted-mask", truth) == (None, None)
+    assert reveal("predicted-mask", truth) == (None, None)
 
 
 def test_the_hull_with_the_target_mask_lies_inside_of_it():
@@ -230,7 +230,7 @@ def test_training_samples_follow_the_protocol():
     assert samples["strict"].view.target_mask is samples["hull-with-target-mask"].view.target_mask is None
     outside = {name: int((s.view.mask[truth.mask[0] == 0] > 0).sum()) for name, s in samples.items()}
     assert outside["hull-with-target-mask"] < outside["strict"] == outside["target-mask"]
-    assert revealed("strict", truth) == (None, None)
+    assert reveal("strict", truth) == (None, None)
 
 
 def test_views_are_selected_by_angle_or_by_direction():

@@ -17,7 +17,7 @@ from viewmend.models.compositing import composite
 from viewmend.models.paper.config import paper_small
 from viewmend.models.paper.context import window_times
 from viewmend.scenes.held_out import LeaveOneOutScene
-from viewmend.scenes.studio_scenes import lengthened, procedural_set, turning_set
+from viewmend.scenes.studio_scenes import lengthen, procedural_set, turning_set
 from viewmend.stream import Stream
 
 
@@ -67,7 +67,7 @@ def test_a_scene_without_frames_fails(turning):
 
 
 def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_frames():
-    short, long = procedural_set(), lengthened(procedural_set())
+    short, long = procedural_set(), lengthen(procedural_set())
     assert [s.name for s in long[:2]] == ["P-long-10000", "P-long-10001"] and {s.set for s in long} == {
         "P-long"
     }

@@ -19,7 +19,7 @@ from viewmend.studio.retarget import (
 )
 
 
-def posed(body: Retarget, frame: int) -> torch.Tensor:
+def skin(body: Retarget, frame: int) -> torch.Tensor:
     """World matrices of the nodes in a frame."""
     hips = body.hips, body.hips_path[frame]
     return node_matrices(body.character, body.upright_from_file, body.driver, body.rotations[frame], hips)

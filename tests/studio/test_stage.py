@@ -235,6 +235,6 @@ def test_posing_is_the_weighted_mean_of_rigid_motions(rng):
         for slot in range(4):
             motion = motions[joints[v, slot]]
             expected[v] += bound.weights[v, slot] * (motion[:3, :3] @ points[v] + motion[:3, 3])
-    torch.testing.assert_close(bound.posed(motions).mesh.vertices, expected)
-    moved_by_one = replace(bound, joints=torch.full_like(joints, 2)).posed(motions)
+    torch.testing.assert_close(bound.skin(motions).mesh.vertices, expected)
+    moved_by_one = replace(bound, joints=torch.full_like(joints, 2)).skin(motions)
     torch.testing.assert_close(moved_by_one.normals, normals @ motions[2, :3, :3].T)

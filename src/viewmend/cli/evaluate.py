@@ -253,7 +253,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
             raise ValueError(f"expected --performers DIR for set {name}, got none; P needs no data")
         else:
             scenes = studio.performer_set(options.performers, options.motions, frames, options.size)
-        return _one_in(options, studio.lengthened(scenes) if name in LONG_SETS else scenes)
+        return _one_in(options, studio.lengthen(scenes) if name in LONG_SETS else scenes)
     prepared = asdict(options.preparation)
     if is_splits(Path(name)):
         if options.inputs != "all" or options.format is not None:

@@ -24,7 +24,7 @@ from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.models.registry import MASK_MODEL, error_model_for, make_method
 from viewmend.predicted_mask import MaskPredictor
-from viewmend.scenes.held_out import LeaveOneOutScene, Protocol, revealed
+from viewmend.scenes.held_out import LeaveOneOutScene, Protocol, reveal
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import Picture, picture
@@ -139,7 +139,7 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, In
     depth_model = error_model_for(Unfilled(), settings.device) if config.geometry == "fused" else None
     for frame in (to_device(own, settings.device) for own in scene.frames()):
         stream = Stream(Unfilled(), config, frame.bounds, depth_model)
-        target_mask, own = revealed(settings.protocol, frame.truth)
+        target_mask, own = reveal(settings.protocol, frame.truth)
         carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)
         if settings.protocol == "predicted-mask":

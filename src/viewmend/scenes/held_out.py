@@ -45,7 +45,7 @@ def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
     return () if split == "validation" else tuple(places)
 
 
-def revealed(
+def reveal(
     protocol: Protocol, truth: MultiViewFrame | None
 ) -> tuple[Float[Tensor, "height width"] | None, Silhouettes | None]:
     """What a protocol reveals of the held-out camera (one view): M_t, and a silhouette that carves the hull."""

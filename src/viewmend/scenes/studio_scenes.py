@@ -166,13 +166,13 @@ def procedural_set(
 
 def _scene(name: str, set: str, cameras: int, style: str, config: StudioConfig, **more: Any) -> StudioScene:
     """A scene seen by a ring of cameras, of which the seed leaves out one: any, but not in step with the seed."""
-    held = _held(config.seed, cameras)
+    held = _held_out_camera(config.seed, cameras)
     return StudioScene(
         name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more
     )
 
 
-def _held(seed: int, cameras: int) -> str:
+def _held_out_camera(seed: int, cameras: int) -> str:
     """The camera that a seed leaves out."""
     return f"cam{int(np.random.SeedSequence([seed, cameras]).generate_state(1)[0]) % cameras:02d}"
 
@@ -247,14 +247,14 @@ def _rig_scene(set: RigName, name: str, seed: int, size_px: int) -> StudioScene:
         rig=f"{cameras} cameras, {placed}",
         style="",
         config=StudioConfig(seed=seed, cameras=cameras, rig=placed, frames=frames, size_px=size_px),
-        held=_held(seed, cameras),
+        held=_held_out_camera(seed, cameras),
         scored_from=RIG_TIMES[-1],
         times=RIG_TIMES,
         coloured=RIG_COLOURED,
     )
 
 
-def lengthened(scenes: Sequence[StudioScene]) -> tuple[StudioScene, ...]:
+def lengthen(scenes: Sequence[StudioScene]) -> tuple[StudioScene, ...]:
     """P-long of P, Q-long of Q: the same scenes of `LONG_FRAMES` frames, whose last `FRAMES` are scored."""
     return tuple(
         replace(

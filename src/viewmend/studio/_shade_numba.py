@@ -1,4 +1,4 @@
-"""The shading's fast path on the CPU: scalar loops compiled by numba.
+"""Shades pixels on the CPU: scalar loops compiled by numba.
 
 Rows of arrays are never sliced in the loops: each slice counts references, which threads then fight over.
 """
@@ -17,7 +17,7 @@ class Scene(NamedTuple):
     """(vertex, 11) float32: x y z, u v, normal, irradiance."""
     faces: np.ndarray
     textures: np.ndarray
-    """(face): which texture."""
+    """Index of each face's texture."""
     texels: np.ndarray
     first: np.ndarray
     size: np.ndarray
@@ -168,7 +168,7 @@ def add_highlights(scene, center, at, out):
 
 
 def encoding(entries=4096):
-    """Tables for `encode`: the linear light half way between 8-bit sRGB levels, and a level not above each entry's."""
+    """Make the tables of `encode`: linear light halfway between 8-bit sRGB levels, and a first guess."""
     halves = (np.arange(255) + 0.5) / 255
     steps = np.where(halves <= 0.04045, halves / 12.92, ((halves + 0.055) / 1.055) ** 2.4)
     return steps, np.searchsorted(steps, np.arange(entries + 1) / entries)
@@ -176,7 +176,7 @@ def encoding(entries=4096):
 
 @kernel
 def encode(linear, steps, guesses):
-    """8-bit sRGB of linear light, by tables: a power for each pixel would cost more than its shading."""
+    """Encode linear light as 8-bit sRGB with tables: a power per pixel would cost more than its shading."""
     if not linear > 0:
         return np.uint8(0)
     value = min(np.float64(linear), 1.0)
@@ -187,8 +187,8 @@ def encode(linear, steps, guesses):
 
 
 @kernel
-def unshadowed(pixels, z, depth, bias, seen):
-    """One light of `render.visibility`."""
+def shadow_visibility(pixels, z, depth, bias, seen):
+    """Fill `seen` with the visibility of one light at each vertex; see `render.visibility`."""
     last_row = depth.shape[0] - 1
     last_column = depth.shape[1] - 1
     for i in range(z.shape[0]):

@@ -28,35 +28,39 @@ LIMBS = {
     "hands": ("", "", ("LeftHand", "RightHand")),
     "head": ("", "", ("Head",)),
 }
-"""Hands and head are never clothed."""
+"""Each limb's upper and lower joint, and the parts whose joints move it. Hands and head are
+never clothed."""
 Limbs = Int[np.ndarray, "height width"]
-"""Positions in `NAMES`, -1 for none."""
+"""Indices into `NAMES`; -1 for none."""
 NAMES = tuple(LIMBS)
 TRUNK, LEGS, FEET, HANDS, HEAD = (
     NAMES.index(name) for name in ("trunk", "left leg", "feet", "hands", "head")
 )
 
 SHOULDER_M = 0.75
-"""Where sleeves begin on the chart of a cloth: what is across the chest is not on them."""
+"""Height on the chart of a cloth at which sleeves begin, metres; it keeps them below patterns
+across the chest."""
 SKIN_RAD = (0.42, 0.25)
-"""Skin has a hue (direction of a, b in CIELAB) of hands or face, at most this much redder or yellower."""
+"""Skin may be this much redder and yellower than the hues of hands and face: radians in the a-b
+plane of CIELAB."""
 SKIN_CHROMA = (0.5, 1.7)
-"""Skin also has a chroma within these multiples of theirs: bare legs are darker, greyer and redder
-than hands."""
+"""Skin has a chroma within these multiples of theirs: bare legs are darker, greyer and
+redder than hands."""
 LIGHTNESS = 0.5
 """Weight of lightness relative to the two hues when garments are separated; folds change lightness."""
-MOST_GARMENTS = 4
-APART_LAB = 18.0
-"""Cloth whose colours are closer than this is one garment."""
-LEAST_SHARE = 0.02
-"""Fraction of the cloth below which a garment is part of the one next in colour."""
+MAX_GARMENTS = 4
+MIN_DISTANCE_LAB = 18.0
+"""Colours that are closer than this in CIELAB belong to one garment."""
+MIN_FRACTION = 0.02
+"""A garment that covers less than this fraction of the cloth is merged with the one next in
+colour."""
 FACE_M = 0.06
-"""The face is what is this far in front of the head's joint."""
+"""The face lies in front of the head's joint by at least this distance, metres."""
 MARGIN_PX = 4
-"""How far cloth continues, at half size, over texels that no face shows."""
+"""Cloth continues by this many pixels, at half size, over texels that no face shows."""
 BODY_SHARE = 0.25
-"""Textures of which less than this lies neither on the head nor on the hands are hair, hats,
-glasses, gloves."""
+"""Fraction of a texture outside of head and hands below which it has no clothes, but hair, hats,
+glasses or gloves."""
 CHART = Canvas(1.4, 1.65, 250.0)
 """Canvas of a flat cloth: around the trunk with 0 in front, and from the soles to the collar."""
 CHEST_M = 1.22
@@ -64,11 +68,11 @@ CHEST_M = 1.22
 FOLDS = 0.12
 """Lightness that is added to both sides of the ratio that keeps folds: black cloth would be all
 noise."""
-_DYED = 0.3
+_DYED_FRACTION = 0.3
 """Fraction of garments that are dyed instead of replaced; shoes always are."""
-_ONE_PIECE = 0.4
+_ONE_PIECE_FRACTION = 0.4
 """Fraction of overalls that stay in one piece; the others become a top and trousers."""
-_LETTERED = 0.4
+_LETTERED_FRACTION = 0.4
 """Fraction of quietly patterned tops with text across the chest."""
 _GRAY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in luma (BT.601)."""
@@ -79,36 +83,38 @@ class Garments:
     """The cloth of one texture, at half its width and height."""
 
     cover: Float[np.ndarray, "garment height width"]
-    """1 where a garment is, and next to it where no face shows the texture (smaller levels of it
-    do); 0 on hands and head."""
+    """Coverage of each garment: 1 on its texels and on hidden ones next to them, so that mipmaps do
+    not mix in other colours; 0 on hands and head."""
     shown: Bool[np.ndarray, "height width"]
     """Texels that a face shows."""
     bare: Bool[np.ndarray, "height width"]
     """Texels of hands and head."""
     around_m: Plane
-    """Way around the limb, 0 in front, growing towards the body's left (for arms: some fixed side)."""
+    """Distance around the limb, metres: 0 in front, growing towards the body's left (for arms, to
+    some fixed side)."""
     along_m: Plane
-    """Height above the soles; on arms `SHOULDER_M` at the shoulder, falling towards the hand."""
-    dress: tuple[int, ...]
+    """Height above the soles, metres; on arms, `SHOULDER_M` at the shoulder, falling
+    towards the hand."""
+    color_label: tuple[int, ...]
     """Number of the colour that each garment was found by; both halves of an overall have
     the same."""
     shoes: tuple[bool, ...]
-    """Garments that are on the feet."""
+    """Whether each garment is on the feet."""
 
 
 @dataclass(frozen=True)
 class RestBody:
-    """A character upright at rest: metres, y up, facing +z."""
+    """A character in its upright rest pose: metres, y up, facing +z."""
 
     vertices: Float[Tensor, "vertex 3"]
     joints: dict[str, Float[np.ndarray, "3"]]
-    """Where each part's joint is."""
+    """Position of each part's joint, metres."""
     limb_of_face: Int[Tensor, "face"]
-    """Position in `NAMES`."""
+    """Index into `NAMES`."""
 
 
 def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> RestBody:
-    """Stand a character in its rest pose, and assign each face to the limb whose joints move it most.
+    """Put a character into its upright rest pose, and assign each face to the limb whose joints move it most.
 
     Raises:
         ValueError: the skeleton is not human.
@@ -123,7 +129,7 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
     limb = torch.tensor(limb_of_node)[character.node_of_joint][character.joints]
     share = torch.zeros(len(limb), len(NAMES)).scatter_add_(1, limb, character.weights)
     matrices = world[character.node_of_joint] @ character.joint_from_bind
-    vertices = character.posed(matrices).mesh.vertices
+    vertices = character.skin(matrices).mesh.vertices
     joints = {
         part_of[n.name]: world[i, :3, 3].numpy() for i, n in enumerate(character.nodes) if n.name in part_of
     }
@@ -131,7 +137,7 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
 
 
 def find_garments(character: Character, body: RestBody) -> list[Garments | None]:
-    """The cloth of each texture, None where there is none (hair, eyes, bare skin)."""
+    """Find the garments on each texture; None for textures without any (hair, eyes, bare skin)."""
     lab = []
     maps = []
     for n, texture in enumerate(character.rest.textures):
@@ -147,7 +153,7 @@ def find_garments(character: Character, body: RestBody) -> list[Garments | None]
 def _texels(
     character: Character, body: RestBody, texture: int, width: int, height: int
 ) -> tuple[Limbs, Image]:
-    """Limb of each texel, -1 where no face shows it, and its place at rest."""
+    """Compute the limb of each texel, -1 where no face shows it, and its position in the rest pose."""
     rest = character.rest
     of_texture = (rest.texture_of_face == texture).nonzero()[:, 0]
     flat = Mesh(torch.cat([rest.uv, torch.ones(len(rest.uv), 1)], 1), rest.mesh.faces[of_texture])
@@ -162,7 +168,7 @@ def _texels(
 def _skin_hues(
     lab: list[np.ndarray], maps: list[tuple[np.ndarray, np.ndarray]], body: RestBody
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Hues (a and b) of the hands and of the face, None where neither shows; hair and gloves do not count."""
+    """Find the hues (a and b) of hands and face; None if neither shows. Hair and gloves do not count."""
     face = body.joints["Head"][2] + FACE_M if "Head" in body.joints else -np.inf
     hands = []
     faces = []
@@ -175,7 +181,7 @@ def _skin_hues(
 
 
 def _is_skin(lab: Image, hues: Float[np.ndarray, "2 2"]) -> Bool[np.ndarray, "height width"]:
-    """Texels that look like hands and face (see `SKIN_RAD`)."""
+    """Find texels whose hue and chroma are those of hands and face (see `SKIN_RAD`)."""
     angle = np.arctan2(hues[:, 1], hues[:, 0])
     chroma = np.linalg.norm(hues, axis=1)
     red = angle.min() - SKIN_RAD[0]
@@ -190,13 +196,13 @@ def _is_skin(lab: Image, hues: Float[np.ndarray, "2 2"]) -> Bool[np.ndarray, "he
 
 
 def _centers(values: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "color 3"]:
-    """Colours that stand for many: farthest first until none is far from all, then two rounds of means."""
+    """Cluster colours: the farthest is added until none is far from all; then two rounds of k-means."""
     centers = np.median(values, 0)[None]
-    while len(centers) < MOST_GARMENTS:
+    while len(centers) < MAX_GARMENTS:
         distance = np.sqrt(((values[:, None] - centers) ** 2).sum(-1).min(1))
         # Not the very farthest, which may be a speck.
         far = int(np.argsort(distance)[int(0.97 * (len(values) - 1))])
-        if distance[far] < APART_LAB:
+        if distance[far] < MIN_DISTANCE_LAB:
             break
         centers = np.concatenate([centers, values[far][None]])
     for _ in range(2):
@@ -210,7 +216,7 @@ def _centers(values: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "color 
 def _nearest(
     values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "color 3"]
 ) -> Int[np.ndarray, "*any"]:
-    """Which centre is nearest to each value."""
+    """Index of the centre nearest to each value."""
     return (0.5 * (centers**2).sum(1) - values @ centers.T).argmin(-1)
 
 
@@ -225,27 +231,29 @@ def _garments(
     naked = np.zeros_like(clothable) if hues is None else clothable * _is_skin(lab, hues)
     cloth = clothable * (_smooth(naked, 9) < 0.5 * _smooth(clothable, 9))
     inside = cloth > 0
-    if inside.sum() < LEAST_SHARE * cloth.size:
+    if inside.sum() < MIN_FRACTION * cloth.size:
         return None
     weight = np.maximum(_smooth(cloth, 3), 1e-3)
     color = _smooth(lab * cloth[..., None] * np.array([LIGHTNESS, 1, 1], np.float32), 3) / weight[..., None]
     label = _nearest(color, _centers(color[inside][::23]))
-    around, along = _unrolled(limb, place, body)
+    around, along = _unroll_limbs(limb, place, body)
     below = (limb >= LEGS) | (limb == TRUNK) & (
         along < float(body.joints["Hips"][1] - body.vertices[:, 1].min())
     )
     covers = []
-    dress = []
+    color_label = []
     shoes = []
     for n, where in itertools.product(range(label.max() + 1), (~below, below & (limb < FEET), limb == FEET)):
         part = inside & (label == n) & where
-        if part.sum() > LEAST_SHARE * inside.sum():
+        if part.sum() > MIN_FRACTION * inside.sum():
             margin = (_smooth(part, 2 * MARGIN_PX + 1) > 0) & ~shown
             covers.append((part | margin).astype(np.float32))
-            dress.append(n)
+            color_label.append(n)
             shoes.append(bool((limb[part] == FEET).any()))
     return (
-        Garments(np.stack(covers), shown, bare, around, along, tuple(dress), tuple(shoes)) if covers else None
+        Garments(np.stack(covers), shown, bare, around, along, tuple(color_label), tuple(shoes))
+        if covers
+        else None
     )
 
 
@@ -253,8 +261,8 @@ def _smooth(values: np.ndarray, size: int) -> np.ndarray:
     return cv2.blur(values.astype(np.float32), (size, size))
 
 
-def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
-    """Coordinates around and along each limb, as if it were a cylinder."""
+def _unroll_limbs(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
+    """Compute coordinates around and along each limb, as if it were a cylinder."""
     around = np.zeros(limb.shape, np.float32)
     along = np.zeros(limb.shape, np.float32)
     floor = float(body.vertices[:, 1].min())
@@ -282,7 +290,7 @@ def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
 def vary_cloth(
     character: Character, upright_from_file: Float[Tensor, "4 4"], variety: float, seed: int
 ) -> Character:
-    """The character in other clothes; skin, hair and eyes are unchanged.
+    """Change a character's clothes; skin, hair and eyes are unchanged.
 
     Each garment is found by its colour, and with a chance of `variety` either dyed (its own pattern
     in other hues) or replaced by a seeded cloth: plain, striped, checked, printed or lettered,
@@ -306,19 +314,23 @@ def vary_cloth(
             continue
         image = cv2.merge(list(texture.numpy()))
         seeds: dict[int, int] = {}
-        for n, (dress, shoe) in enumerate(zip(garments.dress, garments.shoes, strict=True)):
+        for n, (label, is_shoe) in enumerate(zip(garments.color_label, garments.shoes, strict=True)):
             changes = rng.random() < variety
             seed = int(rng.integers(2**31))
             # The halves of an overall: the second takes the seed of the first.
-            seed = seeds[dress] if not shoe and dress in seeds and rng.random() < _ONE_PIECE else seed
-            seeds[dress] = seed
+            seed = (
+                seeds[label]
+                if not is_shoe and label in seeds and rng.random() < _ONE_PIECE_FRACTION
+                else seed
+            )
+            seeds[label] = seed
             if changes:
-                _dress(image, garments, n, np.random.default_rng(seed))
+                _change_garment(image, garments, n, np.random.default_rng(seed))
         textures.append(torch.from_numpy(np.stack(cv2.split(image))))
     return replace(character, rest=replace(character.rest, textures=tuple(textures)))
 
 
-def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -> None:
+def _change_garment(image: Image, garments: Garments, n: int, rng: np.random.Generator) -> None:
     """Change one garment of a texture, in place."""
     rows, columns = (np.flatnonzero(garments.cover[n].any(axis)) for axis in (1, 0))
     half = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
@@ -333,8 +345,8 @@ def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -
     # Bilinear edges are soft, and would reach half a texel into hands and neck.
     bare = cv2.resize(garments.bare[half].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     cover = np.where(bare, 0, at_full_size(garments.cover[n][half]))[..., None]
-    if garments.shoes[n] or rng.random() < _DYED:
-        new = _dyed(own, rng)
+    if garments.shoes[n] or rng.random() < _DYED_FRACTION:
+        new = _dye(own, rng)
     else:
         color = at_full_size(_colors(garments, n, half, rng))
         new = np.clip(
@@ -343,8 +355,8 @@ def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -
     own += cover * (new - own)
 
 
-def _dyed(own: Image, rng: np.random.Generator) -> Image:
-    """Hues turned, colours stronger or paler, lighter or darker, and tinted: what is grey takes a colour, too."""
+def _dye(own: Image, rng: np.random.Generator) -> Image:
+    """Rotate hues, change saturation and brightness, and tint, so that grey takes on a colour too."""
     turn = rng.uniform(0, 2 * np.pi)
     strength = rng.uniform(0.4, 1.2)
     gain = np.exp(rng.uniform(-0.35, 0.45))
@@ -358,11 +370,11 @@ def _dyed(own: Image, rng: np.random.Generator) -> Image:
 
 
 def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.random.Generator) -> Image:
-    """Another cloth on the garment's window, without folds; around visible texels its mean colour."""
+    """Paint another cloth on the garment's window, without folds; hidden texels have its mean colour."""
     fabric = sample_fabric(rng)
     cloth = fabric.paint(CHART)
     # Perhaps with a word across the chest.
-    if fabric.kind in QUIET and rng.random() < _LETTERED:
+    if fabric.kind in QUIET and rng.random() < _LETTERED_FRACTION:
         word = WORDS[int(rng.integers(len(WORDS)))]
         cloth = write(cloth, CHART, word, fabric.colors[2], (0.0, CHEST_M), rng.uniform(0.2, 0.3))
     chart = (255 * cloth).astype(np.uint8)
@@ -383,7 +395,7 @@ def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.ran
 
 
 def _folds(own: Image, cover: Plane, shown: Plane) -> Float[np.ndarray, "height width 1"]:
-    """Shading of a garment, around 1; 1 outside visible texels."""
+    """Estimate the shading of a garment, around 1; 1 on hidden texels."""
     gray = cv2.transform(own, _GRAY[None])
     weight = cover * shown
     mean = float((gray * weight).sum() / max(float(weight.sum()), 1e-6))

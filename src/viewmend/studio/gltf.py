@@ -22,9 +22,9 @@ from viewmend.studio.performer import BoundMesh, TexturedMesh
 from viewmend.utils.untrusted_input import read_json, shown
 
 MAX_BYTES = 2 * 10**9
-"""The largest file that is read."""
+"""Size of the largest file that is read, in bytes."""
 MAX_TEXELS = 2**26
-"""The most pixels of a texture."""
+"""Largest number of pixels of a texture."""
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -46,7 +46,7 @@ class Document:
     buffers: tuple[bytes, ...] = field(repr=False)
 
     def fault(self, text: str) -> CaptureError:
-        """The error for a file that has to be exported in another way."""
+        """Make the error for a file that has to be exported in another way."""
         return CaptureError(f"{self.path}: {text}; export it again")
 
     def entry(self, kind: str, index: int) -> Mapping[str, Any]:
@@ -199,7 +199,7 @@ class Node:
 
     name: str
     parent: int
-    """Position of the parent among the character's nodes, -1 for a root; parents come first."""
+    """Index of the parent among the character's nodes, -1 for a root; parents come first."""
     translation: Float[Tensor, "3"]
     rotation: Float[Tensor, "3 3"]
     scale: Float[Tensor, "3"]
@@ -210,14 +210,15 @@ class Character(BoundMesh):
     """A character in its rest pose: all parts as one mesh, in the file's units (glTF: metres, y up)."""
 
     nodes: tuple[Node, ...]
-    """`joints` are positions in `node_of_joint`, which are positions here."""
+    """Nodes of the tree. `joints` are indices into `node_of_joint`, whose values are indices into
+    these nodes."""
     node_of_joint: Int[Tensor, "joint"]
     joint_from_bind: Float[Tensor, "joint 4 4"]
     """Inverse bind matrices."""
 
 
 def load_character(path: Path) -> Character:
-    """Read a character; parts without a skin follow the node that they hang on.
+    """Read a character; parts without a skin follow the node that they are attached to.
 
     Opaque base colours only: alpha, normal maps, morph targets and animations are ignored.
 
@@ -391,7 +392,7 @@ class _Parts:
         return self.first_joint[key]
 
     def character(self, nodes: tuple[Node, ...]) -> Character:
-        """All that was added, as tensors."""
+        """Combine all that was added, as tensors."""
 
         def floats(values: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

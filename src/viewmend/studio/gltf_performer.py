@@ -15,12 +15,12 @@ from viewmend.studio.performer import TexturedMesh
 from viewmend.studio.retarget import Retarget, retarget
 
 ROAM_M = 0.7
-"""How far the slow part of a path may lead away from the stage's centre."""
+"""Largest distance of the slow part of a path from the stage's centre, metres."""
 SLOW_S = 0.8
 """Standard deviation of the Gaussian that splits a path into a slow and a fast part."""
 FLOOR_SAMPLES = 16
 FLIGHT_M = 0.03
-"""Soles this much above their lowest few per cent count as flight, not as floor."""
+"""Soles this many metres above their lowest few per cent are in flight, not on the floor."""
 
 
 class GltfPerformer:
@@ -41,7 +41,7 @@ class GltfPerformer:
         duration_s: float = 2.0,
         cloth_variety: float = 0.0,
     ) -> None:
-        """Load both files; `cloth_variety` is the share of the character's garments that the seed changes.
+        """Load both files; `cloth_variety` is the fraction of the character's garments that the seed changes.
 
         Raises:
             CaptureError: a file is unreadable, or its skeleton is not a human one.
@@ -73,10 +73,10 @@ class GltfPerformer:
         matrices = self._body.joint_matrices(frame)
         matrices[:, :3, 3] += torch.lerp(self._shift[before], self._shift[after], frame - before)
         matrices[:, :3] = self._stage_from_motion @ matrices[:, :3]
-        return self.character.posed(matrices)
+        return self.character.skin(matrices)
 
     def _frame(self, clip_s: float) -> float:
-        """Frame number at a time of the clip, back and forth past its ends."""
+        """Frame number at a time of the clip, which plays back and forth."""
         last = len(self.motion.root) - 1
         if last == 0:
             return 0.0
@@ -91,13 +91,13 @@ class GltfPerformer:
         lows = []
         for n in range(min(FLOOR_SAMPLES, count)):
             matrices = self._body.joint_matrices(float(n * count // min(FLOOR_SAMPLES, count)))
-            lows.append(self.character.posed(matrices).mesh.vertices[:, 1].min())
+            lows.append(self.character.skin(matrices).mesh.vertices[:, 1].min())
         heights = torch.stack(lows)
         return float(torch.minimum(heights.quantile(0.5), heights.quantile(0.05) + FLIGHT_M))
 
 
 def _stage_shift(path: Float[Tensor, "frame 3"], motion: Motion, middle_s: float) -> Float[Tensor, "frame 3"]:
-    """What to add to each frame so that a path stays near the stage's centre; y is 0.
+    """Compute the offset of each frame that keeps a path near the stage's centre; y is 0.
 
     The slow part of the path, seen from where it is at `middle_s`, is squeezed into a disc of `ROAM_M`.
     """

@@ -1,4 +1,4 @@
-"""What real stages get wrong, each switchable and seeded: colour, noise, compression, masks, calibration."""
+"""Adds imperfections of real stages, optional and seeded: colour, noise, compression, masks, calibration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ SPILL_PX = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
-    """Strengths; all are off by default."""
+    """Strengths of the imperfections; all are off by default."""
 
     exposure_stops: float = 0.0
     """Standard deviation of the cameras' exposure, in powers of two; constant in time."""
@@ -36,17 +36,18 @@ class Imperfections:
     read_noise: float = 0.0
     """Standard deviation of the noise at black, in [0, 1] of sRGB."""
     spill: float = 0.0
-    """How much the background colours the subject near its outline, in [0, 1]; needs a background."""
+    """Strength of the background's colour on the subject near its outline, in [0, 1]; needs a
+    background."""
     jpeg_quality: int | None = None
     """Compress the images at this quality, 1 to 100; None for no compression."""
     mask_edge_px: float = 0.0
-    """How far mask outlines wander (about one standard deviation) and how soft they become, in pixels."""
+    """Standard deviation of the wandering of mask outlines, and their softness, in pixels."""
     mask_holes: float = 0.0
     """Mean number of spots of missing foreground per mask."""
     mask_blobs: float = 0.0
     """Mean number of spots of false foreground per mask."""
     mask_hard: bool = False
-    """Masks are cut at one half, as recorded ones often are, instead of soft at outlines."""
+    """Threshold masks at one half, as recorded ones often are, instead of soft outlines."""
     calibration_px: float = 0.0
     """Standard deviation of the cameras' wrong orientation, as pixels in the image; constant in time."""
     calibration_m: float = 0.0
@@ -71,7 +72,7 @@ class Imperfections:
 
 
 def imperfect_cameras(cameras: Cameras, imperfections: Imperfections, seed: int) -> Cameras:
-    """The calibration that a capture would state of cameras that truly stand elsewhere: slightly wrong."""
+    """Perturb a calibration: what a capture would state of cameras that truly stand elsewhere."""
     if imperfections.calibration_px == 0 and imperfections.calibration_m == 0:
         return cameras
     wrong = cameras.camera_from_world.clone()
@@ -90,7 +91,7 @@ def imperfect_frame(
     background: Float[Tensor, "view 3 height width"] | None = None,
     numbers: Sequence[int] | None = None,
 ) -> MultiViewFrame:
-    """A frame as a real stage would have captured it; its depth and calibration stay true.
+    """Apply the imperfections to a frame; its depth and calibration stay true.
 
     Args:
         frame: with masks.
@@ -122,7 +123,7 @@ def imperfect_masks(
     time: int,
     numbers: Sequence[int],
 ) -> UInt8[Tensor, "view height width"]:
-    """The masks that `imperfect_frame` gives cameras of one size; `numbers` are their positions in the rig."""
+    """Compute the masks of `imperfect_frame` alone; `numbers` are the cameras' positions in the rig."""
     if imperfections == Imperfections():
         return masks
     pairs = zip(masks, numbers, strict=True)
@@ -130,14 +131,14 @@ def imperfect_masks(
 
 
 def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfections, seeds: Seeds) -> Picture:
-    """Spill, then exposure and white balance in linear light, noise, compression.
+    """Apply spill, then exposure and white balance in linear light, noise and compression.
 
     Gains and strengths of noise are looked up by 8-bit level: powers for every pixel would cost as
     much as drawing.
     """
     seed, view, time = seeds
     if it.spill and background is not None:
-        rgb = _stained(rgb, mask, background, it.spill)
+        rgb = _add_spill(rgb, mask, background, it.spill)
     level = (torch.arange(256, device=rgb.device) / 255).expand(3, -1)
     if it.exposure_stops or it.white_balance:
         draw = torch.randn(4, generator=_generator(seed, 2, view, 0)).to(level)
@@ -165,10 +166,10 @@ def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfecti
     )
 
 
-def _stained(rgb: Picture, mask: Mask, background: Backdrop, strength: float) -> Picture:
-    """The subject with the background's colour on it, the more the nearer to its outline."""
+def _add_spill(rgb: Picture, mask: Mask, background: Backdrop, strength: float) -> Picture:
+    """Add the background's colour to the subject, more strongly near its outline."""
     window = _window(mask, SPILL_PX)
-    inside = _blurred(mask[window].float() / 255, SPILL_PX)
+    inside = _blur(mask[window].float() / 255, SPILL_PX)
     share = strength * 2 * (1 - inside).clamp(0, 0.5) * (mask[window] > 0)
     # Further than the blur reaches nothing is stained; its tails are below a level.
     near = share > strength / 500
@@ -181,9 +182,9 @@ def _stained(rgb: Picture, mask: Mask, background: Backdrop, strength: float) ->
 
 
 def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
-    """Rows and columns that hold all of a mask, and as much around it as a blur reaches."""
+    """Rows and columns that contain a mask, and a margin around it as wide as a blur."""
     bounds = []
-    margin = _reach(sigma_px)
+    margin = _blur_radius_px(sigma_px)
     for along in (1, 0):
         places = (mask > 0).any(along).nonzero().flatten().tolist() or [0]
         bounds.append(slice(max(0, places[0] - margin), places[-1] + 1 + margin))
@@ -191,7 +192,7 @@ def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
 
 
 def _mask(mask: Mask, it: Imperfections, seeds: Seeds) -> Mask:
-    """Holes and blobs, then an outline that wanders and softens."""
+    """Add holes and blobs to a mask, then let its outline wander and soften."""
     seed, view, time = seeds
     generator = _generator(seed, 4, view, time)
     value = mask.float() / 255
@@ -214,14 +215,14 @@ def _mask(mask: Mask, it: Imperfections, seeds: Seeds) -> Mask:
         # Bounded so that, with this gain, what is flat stays flat: 2.5 (0.5 - 0.3) = 0.5.
         shift = 0.3 * torch.tanh(shift / 0.3)
         value = value.clone()
-        value[window] = (2.5 * (_blurred(part, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
+        value[window] = (2.5 * (_blur(part, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
     if it.mask_hard:
         value = (value > 0.5).to(value)
     return (value * 255).round().to(torch.uint8)
 
 
 def _spot(where: Tensor, generator: torch.Generator) -> Tensor:
-    """An ellipse about a random pixel of `where`, 1 to 4 per cent of the image across."""
+    """Draw an ellipse around a random pixel of `where`, 1 to 4 per cent of the image across."""
     height, width = where.shape
     places = where.nonzero()
     draw = torch.rand(4, generator=generator).tolist()
@@ -234,14 +235,14 @@ def _spot(where: Tensor, generator: torch.Generator) -> Tensor:
     return (y / radii[0]) ** 2 + (x / radii[1] + (draw[3] - 0.5) * y / radii[0]) ** 2 < 1
 
 
-def _reach(sigma_px: float) -> int:
-    """How far a blur looks, pixels."""
+def _blur_radius_px(sigma_px: float) -> int:
+    """Radius of a blur's kernel, pixels."""
     return max(1, round(3 * sigma_px))
 
 
-def _blurred(value: Float[Tensor, "height width"], sigma_px: float) -> Float[Tensor, "height width"]:
+def _blur(value: Float[Tensor, "height width"], sigma_px: float) -> Float[Tensor, "height width"]:
     """Gaussian blur; the outermost pixels continue beyond the image."""
-    reach = _reach(sigma_px)
+    reach = _blur_radius_px(sigma_px)
     offsets = torch.arange(-reach, reach + 1, device=value.device)
     kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
     kernel = kernel / kernel.sum()

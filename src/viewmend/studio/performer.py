@@ -1,4 +1,4 @@
-"""Who stands on the studio's stage: a textured mesh at each moment; and its textures, ready for drawing."""
+"""Performers of the studio: a textured mesh at each moment, and its textures, prepared for drawing."""
 
 import itertools
 from collections.abc import Sequence
@@ -51,8 +51,8 @@ class BoundMesh:
     weights: Float[Tensor, "vertex 4"]
     """They sum to one per vertex."""
 
-    def posed(self, world_from_bind: Float[Tensor, "joint 4 4"]) -> TexturedMesh:
-        """The mesh in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
+    def skin(self, world_from_bind: Float[Tensor, "joint 4 4"]) -> TexturedMesh:
+        """Skin the mesh: the sum over slots of weight * (world_from_bind[joint] vertex), in world metres.
 
         `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind
         matrix. The normals are turned by the same blend and of unit length; vertices that coincide
@@ -65,19 +65,19 @@ class BoundMesh:
         )
         a, b, c, moved = bags.unflatten(1, (3, 4)).unbind(-1)
 
-        def turned(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
+        def rotate(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
             x, y, z = vectors[:, :, None].unbind(1)
             return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
 
-        mesh = Mesh(turned(self.rest.mesh.vertices) + moved, self.rest.mesh.faces)
+        mesh = Mesh(rotate(self.rest.mesh.vertices) + moved, self.rest.mesh.faces)
         return replace(
-            self.rest, mesh=mesh, normals=torch.nn.functional.normalize(turned(self.rest.normals), dim=-1)
+            self.rest, mesh=mesh, normals=torch.nn.functional.normalize(rotate(self.rest.normals), dim=-1)
         )
 
 
 @dataclass(frozen=True)
 class TexturePyramid:
-    """Several textures, each in halving sizes: level l of texture t is `size[t, l]` texels from `first[t, l]` on."""
+    """Mipmaps of several textures: level l of texture t is `size[t, l]` texels from `first[t, l]` on."""
 
     texels: Float[Tensor, "texel 3"]
     """Linear light."""

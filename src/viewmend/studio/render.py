@@ -18,15 +18,15 @@ from viewmend.studio.performer import TexturedMesh, TexturePyramid
 from viewmend.types import MultiViewFrame
 
 _WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
-"""Linear light: green screen, grey, dark, white, blue screen."""
+"""Colours of backdrops in linear light: green screen, grey, dark, white, blue screen."""
 DIRECTIONS = 16
-"""The light of the surroundings is sampled in this many directions."""
+"""Number of directions in which the light of the surroundings is sampled."""
 EVENNESS = 0.65
-"""This share of the light comes from the surroundings, the rest from lamps."""
+"""Fraction of the light that comes from the surroundings; the rest is from lamps."""
 SHADOW_PX = 128
-"""Shadow maps have this side, pixels."""
+"""Height and width of shadow maps, pixels."""
 SHADOW_DISTANCE_M = 12.0
-"""Lights are this far away: near enough to be a pinhole camera, far enough to look parallel."""
+"""Distance of the lights, metres: near enough for a pinhole camera, far enough to look parallel."""
 SHADOW_BIAS_M = 0.015
 GLOSS_DOUBLINGS = 4
 """Highlights fall off with the power 2^this of the half vector's cosine: a power that needs no logarithm."""
@@ -41,15 +41,15 @@ class Lights:
     toward: Float[Tensor, "light 3"]
     """Unit vectors from the stage to each direction."""
     strength: Float[Tensor, "light 3"]
-    """What a white surface that faces the direction reflects of it."""
+    """Light that a white surface facing the direction reflects of it."""
     lamps: Float[Tensor, "lamp 3"]
     """Unit vectors to the lamps."""
     gloss: Float[Tensor, "lamp 3"]
-    """The colour of each lamp's highlight at its middle."""
+    """Colour at the middle of each lamp's highlight."""
 
 
 def stage_lights(seed: int) -> Lights:
-    """Seeded lights as on a capture stage: much the same from all sides, and a little not.
+    """Sample the lights of a capture stage: nearly the same from all sides.
 
     A surrounding that is brighter above than below gives the share `EVENNESS`; three large soft
     lamps of slightly different strength and tint, around and above, give the rest.
@@ -84,7 +84,7 @@ def stage_lights(seed: int) -> Lights:
 def visibility(
     mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights
 ) -> Float[Tensor, "vertex light"]:
-    """How much of each direction the mesh leaves free at its vertices, 0 to 1.
+    """Compute the fraction of each direction that the mesh leaves visible at its vertices, 0 to 1.
 
     One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
     """
@@ -107,14 +107,16 @@ def visibility(
     seen = torch.empty_like(z)
 
     def look(n: int) -> None:
-        kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
+        kernels.shadow_visibility(
+            pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy()
+        )
 
     parallel_for(look, len(cameras))
     return seen.T
 
 
 def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height width"]:
-    """Linear light behind the subject in each camera's image: a wall that darkens downwards into a floor.
+    """Draw the backdrop of each camera's image in linear light: a wall that darkens downwards into a floor.
 
     The colours are seeded and depend on the elevation of a ray only, so that all cameras agree on a
     distant backdrop.
@@ -135,7 +137,7 @@ def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height 
 
 @dataclass(frozen=True)
 class Surface:
-    """A lit scene: per vertex what the shading of a sample interpolates."""
+    """A lit scene: the vertex attributes that shading interpolates."""
 
     scene: TexturedMesh
     irradiance: Float[Tensor, "vertex 3"]
@@ -167,7 +169,7 @@ def render(
         background: what stands behind, linear light; black if None.
         samples_per_side: 2 gives masks in steps of a quarter.
     """
-    fine = _enlarged(cameras, samples_per_side)
+    fine = _sample_cameras(cameras, samples_per_side)
     scene = surface.scene
     lights = surface.lights
     pyramid = surface.pyramid
@@ -200,14 +202,14 @@ def render(
 def render_masks(
     mesh: Mesh, cameras: Cameras, samples_per_side: int = 2
 ) -> UInt8[Tensor, "view height width"]:
-    """The masks that `render` draws, without shading."""
-    covered = rasterize(mesh, _enlarged(cameras, samples_per_side)).triangle >= 0
+    """Draw the masks of `render` alone, without shading."""
+    covered = rasterize(mesh, _sample_cameras(cameras, samples_per_side)).triangle >= 0
     share = avg_pool2d(covered[:, None].float(), samples_per_side)[:, 0]
     return (255 * share).round().to(torch.uint8)
 
 
-def _enlarged(cameras: Cameras, samples_per_side: int) -> Cameras:
-    """Cameras with a pixel for each sample."""
+def _sample_cameras(cameras: Cameras, samples_per_side: int) -> Cameras:
+    """Cameras with one pixel for each sample."""
     if samples_per_side < 1:
         raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
     K = cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None]

@@ -1,4 +1,4 @@
-"""Puts a motion on a character: each limb turns as the actor's does, whatever the two rest poses are."""
+"""Retargets a motion to a character: each limb turns as the actor's does, whatever the two rest poses are."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -94,7 +94,7 @@ def family_table(family: str) -> dict[str, str]:
 
 
 def find_parts(names: Sequence[str]) -> dict[str, str]:
-    """Part -> joint name of any skeleton, given with parents first; parts that it lacks are absent.
+    """Find the joint of each part in any skeleton, given with parents first; parts that it lacks are absent.
 
     A family's table is taken where its required parts are all there, under any common prefix such
     as `mixamorig:` (the family with the most parts wins); otherwise the parts are guessed from the
@@ -126,13 +126,13 @@ def find_parts(names: Sequence[str]) -> dict[str, str]:
 
 
 def _words(name: str) -> str:
-    """Lower case, camel case split by blanks, other separators as blanks."""
+    """Split a name into lower-case words, also at camel case and separators."""
     split = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
     return re.sub(r"[^a-z0-9]+", " ", split.lower()).strip()
 
 
 def _guess(names: Sequence[str]) -> dict[str, str]:
-    """Parts by the words in the names: the joint nearest to the root wins a part."""
+    """Guess parts by the words in the names: the joint nearest to the root wins a part."""
     found: dict[str, str] = {}
     trunk: list[str] = []
     for name in names:
@@ -152,7 +152,7 @@ def _guess(names: Sequence[str]) -> dict[str, str]:
 
 
 def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
-    """Hips, spine, neck and head among the joints without a side."""
+    """Guess hips, spine, neck and head among the joints without a side."""
 
     def first(*keys: str) -> str | None:
         return next((n for key in keys for n in trunk if key in _words(n).replace(" ", "")), None)
@@ -168,7 +168,7 @@ def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Retarget:
-    """A motion made ready for a character: R_j(t) = G_s(j)(t) A_j R0_j for each mapped joint j.
+    """A motion prepared for a character: R_j(t) = G_s(j)(t) A_j R0_j for each mapped joint j.
 
     Both are first brought upright (y up, facing +z, metres): by a turn to the nearest axes, from
     where the hips, the head and the two sides lie in the rest poses, and the character by a power
@@ -202,7 +202,7 @@ class Retarget:
 
 
 def retarget(character: Character, motion: Motion) -> Retarget:
-    """Put a motion on a character.
+    """Retarget a motion to a character.
 
     Raises:
         ValueError: one of the skeletons has no hips, arms or legs by any known name.
@@ -247,7 +247,7 @@ def node_matrices(
     turns: Float[Tensor, "driver 3 3"] | None = None,
     hips: tuple[int, Float[Tensor, "3"]] | None = None,
 ) -> Float[Tensor, "node 4 4"]:
-    """World matrices of the nodes: driven ones turned to `turns` (global rotations), the others as at rest.
+    """Compute world matrices of the nodes; driven ones have the global rotations `turns`.
 
     Local translations and scales stay those of the file, but the hips' node (if given) is
     put at its position.
@@ -269,7 +269,7 @@ def node_matrices(
 
 
 def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
-    """The turn by right angles that brings a rest pose to y up and its left side to +x."""
+    """Find the rotation by right angles that brings a rest pose to y up and its left side to +x."""
 
     def nearest_axis(v: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
         axis = torch.zeros(3)
@@ -325,7 +325,7 @@ def _leg_length(rest: Rest) -> float:
 
 
 def _orthonormal(matrices: Float[Tensor, "batch 3 3"]) -> Float[Tensor, "batch 3 3"]:
-    """The rotations nearest to blends of two near rotations (Gram-Schmidt: exact where they are rotations)."""
+    """Find the rotations nearest to blends of two close rotations (Gram-Schmidt; exact for rotations)."""
     x = torch.nn.functional.normalize(matrices[..., 0], dim=-1)
     y = matrices[..., 1] - (matrices[..., 1] * x).sum(-1, keepdim=True) * x
     y = torch.nn.functional.normalize(y, dim=-1)

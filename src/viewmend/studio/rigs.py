@@ -13,9 +13,10 @@ from viewmend.geometry.orbit import orbit as orbit_of
 from viewmend.geometry.rigid import look_at, rotation_from_axis_angle
 
 SUBJECT_CENTER_M = (0.0, 0.95, 0.0)
-"""Target of all rigs: the middle of a standing person at the centre of the stage."""
+"""Target of all cameras, metres: the middle of a standing person at the stage's centre."""
 VISIBLE_M = 2.4
-"""Height and width that an image holds at the stage's centre: a person of 1.75 m fills three quarters."""
+"""Height and width of the view at the stage's centre, metres; a person of 1.75 m fills
+three quarters."""
 RADIUS_M = 3.0
 """Distance of the cameras from the stage's axis, or from the subject in a dome."""
 HEIGHTS_M = (1.1, 1.8)
@@ -28,17 +29,17 @@ UP = (0.0, 1.0, 0.0)
 
 
 def ring_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
-    """Cameras all around the stage, at alternating heights, with errors as of careful hands (degrees, centimetres)."""
+    """Place cameras around the stage at alternating heights, with small errors (degrees, centimetres)."""
     return _around(count, HEIGHTS_M, size_px, seed)
 
 
 def layered_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
-    """Cameras all around the stage in three layers, placed with the same errors as those of a ring."""
+    """Place cameras around the stage in three layers, with the same errors as those of a ring."""
     return _around(count, LAYER_HEIGHTS_M, size_px, seed)
 
 
 def _around(count: int, heights_m: Sequence[float], size_px: tuple[int, int], seed: int) -> Cameras:
-    """Cameras at equal angles around the stage, whose heights alternate."""
+    """Place cameras at equal angles around the stage, with alternating heights."""
     azimuth = torch.arange(_positive(count)) * 2 * math.pi / count
     height = torch.tensor([heights_m[n % len(heights_m)] for n in range(count)])
     eyes = torch.stack([RADIUS_M * azimuth.sin(), height, RADIUS_M * azimuth.cos()], -1)
@@ -46,7 +47,7 @@ def _around(count: int, heights_m: Sequence[float], size_px: tuple[int, int], se
 
 
 def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
-    """Cameras spread evenly over a part of a sphere around the subject, with errors as of careful hands."""
+    """Spread cameras evenly over a part of a sphere around the subject, with small errors."""
     low, high = (math.sin(e) for e in DOME_RAD)
     y = low + (high - low) * (torch.arange(_positive(count)) + 0.5) / count
     angle = torch.arange(count) * math.pi * (3 - math.sqrt(5))
@@ -58,7 +59,7 @@ def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0
 
 
 def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_rad: float = 0.15) -> Cameras:
-    """Novel cameras on a circle around the middle of who stands on the stage.
+    """Make novel cameras on a circle around the subject's middle.
 
     Azimuth 0 is in front (+z), and azimuths grow towards +x.
 
@@ -74,7 +75,7 @@ def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_
 
 
 def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], seed: int) -> Cameras:
-    """Cameras at about `eyes` that look at about the subject's centre."""
+    """Place cameras near `eyes` that look approximately at the subject's centre."""
     off = torch.randn(len(eyes), 3, 3, generator=torch.Generator().manual_seed(seed))
     center = torch.tensor(SUBJECT_CENTER_M)
     up = torch.tensor(UP)

@@ -39,24 +39,25 @@ class StudioConfig:
     """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds
     from 10000 on are kept for tests and evaluation."""
     cameras: int | Cameras = 12
-    """How many cameras the rig has, or the rig itself, in the stage's world."""
+    """Number of cameras, or the rig itself in the stage's world."""
     rig: Literal["ring", "dome", "layers"] = "ring"
-    """How a number of cameras is placed: in a ring, on a dome, or in three layers."""
+    """Placement of a number of cameras: in a ring, on a dome, or in three layers."""
     frames: int = 30
-    """Length of the capture."""
+    """Number of frames."""
     size_px: int | tuple[int, int] = 512
-    """Images' width and height, or side of square ones; a rig that is given keeps its own."""
+    """Width and height of the images, or side of square ones; a given rig keeps its own."""
     fps: float | int = 30.0
     """Frames per second."""
     performers: Path | None = None
-    """A glTF character (.glb, .gltf), or a folder of which one is picked; None for a procedural scene."""
+    """A glTF character (.glb, .gltf), or a folder from which one is chosen; None for a
+    procedural scene."""
     motions: Path | None = None
-    """A BVH motion, or a folder of which one is picked; goes with `performers`."""
+    """A BVH motion, or a folder from which one is chosen; goes with `performers`."""
     cloth_variety: float = 0.0
-    """Share of a glTF character's garments that get other colours or cloth by seed; 0 keeps them.
+    """Fraction of a glTF character's garments that change colour or cloth by seed; 0 keeps them.
     Procedural performers are always dressed by seed."""
     background: Literal["black", "stage"] = "black"
-    """What the cameras see behind the subject; truth views always have black."""
+    """Background of the cameras' images; ground-truth views are always on black."""
     samples_per_side: int = 2
     """Each pixel is the mean of this many samples squared."""
     imperfections: Imperfections = field(default_factory=Imperfections)
@@ -144,7 +145,7 @@ class Studio:
         return replace(frame, cameras=self.cameras.select(names))
 
     def silhouettes(self, time: int, names: Sequence[str]) -> Silhouettes:
-        """The masks alone of some cameras at index `time`, equal to those of `read`, at a fifth of the cost.
+        """Draw the masks of some cameras at index `time`, equal to those of `read`, at a fifth of the cost.
 
         Raises:
             IndexError: `time` is not in the capture.
@@ -166,7 +167,7 @@ class Studio:
         return [self.cameras.names.index(name) for name in names]
 
     def truth(self, cameras: Cameras, time: int, on_stage: bool = False) -> MultiViewFrame:
-        """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
+        """Render what perfect cameras anywhere would see at index `time`, with exact mask and depth.
 
         Colours are the subject's own, not darkened where the mask is soft: times the mask, they are
         the view on black. With `on_stage`, and a stage, they include what is behind soft pixels, as
@@ -196,7 +197,7 @@ class Studio:
 
 
 def _cast(config: StudioConfig, seed: int) -> Performer:
-    """The performer of the config."""
+    """Make the performer of a config."""
     if config.performers is None and config.motions is None:
         from viewmend.studio.procedural import procedural_scene
 
@@ -213,7 +214,7 @@ def _cast(config: StudioConfig, seed: int) -> Performer:
 
 
 def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -> Path:
-    """The file itself, or one of the folder's."""
+    """Choose the file itself, or one of the folder's."""
     if place.is_file():
         return place
     files = sorted(f for f in place.iterdir() if f.suffix.lower() in suffixes) if place.is_dir() else []

@@ -13,7 +13,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.rendering.view import RenderConfig
-from viewmend.scenes.held_out import LeaveOneOut, Protocol, revealed
+from viewmend.scenes.held_out import LeaveOneOut, Protocol, reveal
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig, SceneConfig
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame
@@ -75,7 +75,7 @@ class HeldOutCamera:
         """The other cameras at a frame, with their hull."""
         carving = None
         if self.protocol == "hull-with-target-mask":
-            _, carving = revealed(self.protocol, self.rig.truth(self.held, time))
+            _, carving = reveal(self.protocol, self.rig.truth(self.held, time))
         return self.stream.add_frame(self.rig.inputs(self.held, time), carving=carving)
 
     def sample(
@@ -92,7 +92,7 @@ class HeldOutCamera:
         known = (
             None if self.protocol == "strict" else self.rig.truth(self.held, time)
         )  # rendered only if needed
-        target_mask, _ = revealed(self.protocol, known)
+        target_mask, _ = reveal(self.protocol, known)
         view = self.stream.with_render_config(render).render(target, time, target_mask=target_mask)
         if float(view.missing.sum()) < min_hole_px:
             return None

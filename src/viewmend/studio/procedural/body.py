@@ -1,4 +1,4 @@
-"""The body's shape: a torso and four limbs as surfaces around their axes, joined by a smooth union of their fields.
+"""Models the body: a torso and four limbs as surfaces around their axes, joined by a smooth union of fields.
 
 Each part is both a parametric surface (angle around the axis, place along it), which gives texture
 coordinates, and a field (signed distance, first order), which gives the union and the skinning
@@ -40,7 +40,7 @@ RADII = ("width", "front", "back")
 
 
 def smooth_table(xs: Float[np.ndarray, "knot"], table: Float[np.ndarray, "knot column"]):
-    """Resample knots evenly and round their corners: (positions [sample], values [sample column])."""
+    """Resample knots evenly and smooth them; returns positions [sample] and values [sample column]."""
     grid = np.linspace(xs[0], xs[-1], 256)
     values = np.stack([np.interp(grid, xs, column) for column in table.T], axis=1)
     for _ in range(2):
@@ -59,11 +59,11 @@ class Torso:
     back: Float[np.ndarray, "sample"]
     z: Float[np.ndarray, "sample"]
     bumps: Float[np.ndarray, "bump 5"]
-    """Azimuth, height, width in radians, width in metres, height of the swelling: bust and buttocks."""
+    """Bust and buttocks: azimuth, height, width in radians, height in metres, and thickness."""
 
     @property
     def arc(self) -> Float[np.ndarray, "sample"]:
-        """Length along the side's outline from the lowest ring, metres: even steps of it make even rows."""
+        """Length along the side's outline from the lowest ring, metres; even steps of it make even rows."""
         steps = np.hypot(np.diff(self.y), np.diff(self.width))
         return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -95,12 +95,12 @@ class Torso:
         radial = (np.hypot(x, z) - self.radius(np.arctan2(x, z), clamped)) / np.hypot(1.0, slope)
         return np.maximum(radial, np.abs(y - clamped)) + np.where(radial > 0, 0.3 * np.abs(y - clamped), 0.0)
 
-    def outside(self, other: "Torso", gap_m: float) -> "Torso":
-        """This torso, widened where it would come nearer than `gap_m` to `other` (on the same samples)."""
+    def widen_around(self, other: "Torso", gap_m: float) -> "Torso":
+        """Widen this torso to keep a distance of at least `gap_m` from `other` (on the same samples)."""
         return replace(self, **{n: np.maximum(getattr(self, n), getattr(other, n) + gap_m) for n in RADII})
 
-    def eased(self, ease_m: float, hang: float = 0.0, flare: float = 0.0) -> "Torso":
-        """The torso of a garment: `ease_m` wider; with `hang` 1 the cloth below the chest never comes back in."""
+    def loosen(self, ease_m: float, hang: float = 0.0, flare: float = 0.0) -> "Torso":
+        """Make the torso of a garment: `ease_m` wider; with `hang` 1, cloth hangs straight from the chest."""
         wider = {"bumps": self.bumps * np.array([1, 1, 1, 1 + 0.6 * hang, 1])}
         below = np.interp(self.y, [self.y[0], self.y[-1] * 0.8], [1.0, 0.0])
         chest = self.y < 0.84 * self.y[-1]
@@ -114,14 +114,14 @@ class Torso:
 
 @dataclass(frozen=True)
 class Limb:
-    """An arm or a leg: a round profile about the line from its first joint to its last. Metres."""
+    """An arm or a leg: a round profile around the line from its first joint to its last. Metres."""
 
     start: Vector
     end: Vector
     t: Float[np.ndarray, "sample"]
     r: Float[np.ndarray, "sample"]
     shift: Float[np.ndarray, "sample"]
-    """How far the centre line stands behind the axis."""
+    """Distance of the centre line behind the axis, metres."""
 
     @property
     def length(self) -> float:
@@ -130,7 +130,7 @@ class Limb:
 
     @cached_property
     def frame(self) -> Rotation:
-        """Rows: sideways, up the limb, and forward."""
+        """Axes as rows: sideways, up the limb, and forward."""
         up = unit(self.start - self.end)
         side = unit(np.cross(up, np.array([0.0, 0.0, 1.0])))
         return np.stack([side, up, np.cross(side, up)])
@@ -154,8 +154,8 @@ class Limb:
         t = np.clip(self.along(points), self.t[0], self.t[-1])
         return np.linalg.norm(points - self.center(t), axis=-1) - np.interp(t, self.t, self.r)
 
-    def eased(self, ease_m: float, hang_from: float = 2.0, flare: float = 0.0) -> "Limb":
-        """The sleeve or leg of a garment; beyond `hang_from` it hangs straight down and widens by `flare` metres."""
+    def loosen(self, ease_m: float, hang_from: float = 2.0, flare: float = 0.0) -> "Limb":
+        """Make a sleeve or trouser leg; beyond `hang_from` it hangs straight and widens by `flare` metres."""
         # Close at the joint, where the garment's trunk begins.
         r = self.r + ease_m * np.interp(self.t, [0.0, 0.25], [0.5, 1.0])
         hanging = self.t > hang_from
@@ -203,12 +203,12 @@ class Body:
 
 
 def opposite(part: int) -> list[int]:
-    """The limb of the other side (a pair's cloth must not grow together); none for the torso."""
+    """The limb of the other side, whose cloth must not merge with this one's; none for the torso."""
     return [] if part == 0 else [part + 1 if part % 2 else part - 1]
 
 
 def build_body(person: Physique, skeleton: Skeleton) -> Body:
-    """The naked shape of this person in the bind pose (head, hands and feet are drawn elsewhere)."""
+    """Build the naked shape of a person in the bind pose; head, hands and feet are drawn elsewhere."""
     H = person.height_m
     f = person.femininity
     w = person.weight
@@ -241,7 +241,7 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
 
 
 def smoothstep(x: Values, low: float, high: float) -> Values:
-    """0 below `low`, 1 above `high` (low < high), smooth between."""
+    """Step smoothly from 0 below `low` to 1 above `high` (low < high)."""
     s = np.clip((x - low) / (high - low), 0, 1)
     return s * s * (3 - 2 * s)
 
@@ -254,12 +254,12 @@ def one_joint(shape: tuple[int, ...], name: str) -> Weights:
 
 
 def mix(first: Weights, second: Weights, share: Values) -> Weights:
-    """`first` where `share` is 0, `second` where it is 1."""
+    """Interpolate from `first` where `share` is 0 to `second` where it is 1."""
     return first + share[..., None] * (second - first)
 
 
 def body_weights(body: Body, points: Points, part: int = 0) -> Weights:
-    """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain.
+    """Compute skinning weights near the body: soft membership in a part, then soft steps along its joints.
 
     Points of a limb's sheet (`part`, as in `Body.fields`) never follow the limb of the other side.
     """
@@ -302,7 +302,7 @@ def _tube(
     radii: Float[np.ndarray, "2 row"],
     columns: int,
 ) -> Float[np.ndarray, "row+1 column 3"]:
-    """Ellipses around a line from its far end to its near one (up), after their tip; `across`: the first radius."""
+    """Make ellipses around a line, from its far end up, after their tip; `across` is the first radius."""
     up = unit(np.gradient(centers, axis=0))
     side = unit(across - up * (across * up).sum(-1, keepdims=True))
     front = np.cross(side, up)
@@ -319,7 +319,7 @@ def unit_grid(shape: tuple[int, ...]) -> Float[np.ndarray, "row column 2"]:
 
 
 def hand_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch]:
-    """One hand, its fingers a little curled; `girth` 1 is average."""
+    """Draw one hand with slightly curled fingers; `girth` 1 is average."""
     H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
     wrist = body.skeleton.at(f"{side}_hand")
@@ -356,7 +356,10 @@ def _finger(
 
 
 def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:
-    """One shoe, its sole on the floor y = 0 in the bind pose. The chart's u runs around, v from heel to tip."""
+    """Draw one shoe, its sole on the floor y = 0 in the bind pose.
+
+    The chart's u runs around the shoe, v from heel to tip.
+    """
     H = body.height_m
     ankle = body.skeleton.at(f"{side}_foot")
     s = np.concatenate([np.linspace(0, 0.1, 6)[:-1], np.linspace(0.1, 0.9, 18), np.linspace(0.9, 1, 7)[1:]])

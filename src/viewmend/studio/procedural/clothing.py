@@ -1,4 +1,4 @@
-"""The tailor: garments cut from the body's own shape and painted with cloth."""
+"""Makes garments from the body's own shape, and paints them with cloth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ LOWER = ("plain", "heather", "pinstripes", "tartan", "blobs", "knit", "zigzag", 
 
 @dataclass(frozen=True)
 class Folds:
-    """Soft creases: displaced geometry, and the shade they cast baked into the cloth."""
+    """Soft creases: displaced geometry, and shading that is painted onto the cloth."""
 
     depth_m: float
     along_m: float
@@ -72,7 +72,7 @@ class Folds:
     def crease(
         self, canvas: Canvas, uv: Float[np.ndarray, "row column 2"]
     ) -> Float[np.ndarray, "row column"]:
-        """Displacement at places of the canvas, metres."""
+        """Compute the displacement at positions on the canvas, metres."""
         height = self.height(canvas).astype(np.float32)
         rows, columns = height.shape
         x = uv[..., 0] * (columns - 1)
@@ -82,17 +82,20 @@ class Folds:
         )
 
     def paint(self, canvas: Canvas, painter: Painter) -> Image:
-        """The cloth in its creases: slopes that face down are darker."""
+        """Paint cloth with creases: slopes that face down are darker."""
         slope = np.gradient(self.height(canvas), axis=0) * canvas.px_per_m
         return np.clip(painter(canvas) * np.clip(1 + 0.8 * slope, 0.65, 1.2)[..., None], 0, 1)
 
 
 BARE = Folds(0.0, 0.1, 0.1, 0, 220.0)
-"""Skin: smooth, and with little to show."""
+"""Skin, which is smooth and has little texture."""
 
 
 def azimuths(columns: int, gap: float = 0.0) -> Azimuths:
-    """Azimuths from back to back, about evenly spaced on an ellipse; with a gap from the front's left edge on."""
+    """Make azimuths from back to back, about evenly spaced on an ellipse.
+
+    A gap begins at the front's left edge.
+    """
     dense = np.linspace(-np.pi, np.pi, 1025) if gap == 0 else np.linspace(gap, 2 * np.pi - gap, 1025)
     r = 1 / np.hypot(np.sin(dense), np.cos(dense) / 0.62)
     steps = np.hypot(np.diff(r * np.sin(dense)), np.diff(r * np.cos(dense)))
@@ -100,7 +103,7 @@ def azimuths(columns: int, gap: float = 0.0) -> Azimuths:
     return np.interp(np.linspace(0, arc[-1], columns), arc, dense)
 
 
-def _closed(around: Azimuths) -> bool:
+def _is_closed(around: Azimuths) -> bool:
     return bool(np.isclose(around[-1] - around[0], 2 * np.pi))
 
 
@@ -114,7 +117,7 @@ def torso_sheet(
     folds: Folds = BARE,
     rows: int = 44,
 ) -> Patch:
-    """The torso of `shape` between the heights `low` and `high` (metres, per azimuth), with lips turned inwards."""
+    """Make a sheet of the torso between two heights (metres, per azimuth), with edges turned inwards."""
     torso = shape.torso
     arc = shape.torso.arc
     s_low, s_high = (np.interp(edge, torso.y, arc) for edge in (low, high))
@@ -142,7 +145,9 @@ def torso_sheet(
         lips.append(axis + 0.93 * (inner - axis) + np.array([0, rise, 0]))
     points = np.concatenate([lips[0][None], points, lips[1][None]])
     uv = np.concatenate([uv[:1], uv, uv[-1:]])
-    return Patch(points, uv, body_weights(body, points), folds.paint(canvas, painter), closed=_closed(around))
+    return Patch(
+        points, uv, body_weights(body, points), folds.paint(canvas, painter), closed=_is_closed(around)
+    )
 
 
 def limb_sheet(
@@ -155,7 +160,10 @@ def limb_sheet(
     folds: Folds = BARE,
     grid: tuple[int, int] = (36, 29),
 ) -> Patch:
-    """A limb of `shape` (part 1..4 of `Body.fields`) from t = `low` (towards the body) to `high`, with a lip there."""
+    """Make a sheet of a limb from t = `low`, near the body, to `high`, with an edge there.
+
+    `part` is 1 to 4, as in `Body.fields`.
+    """
     rows, columns = grid
     limb, naked = (s.limbs[part - 1] for s in (shape, body))
     theta = np.linspace(-np.pi, np.pi, columns)
@@ -176,7 +184,7 @@ def limb_sheet(
 
 
 def skirt_weights(body: Body, points: Points, around: Values) -> Weights:
-    """Weights of a skirt's points: the waist, then its hanging columns, high and low, each between two neighbours."""
+    """Weights of a skirt's points: the waist, and its upper and lower columns."""
     shape = points.shape[:-1]
     column = (around / (2 * np.pi) * SKIRT_COLUMNS) % SKIRT_COLUMNS
     first = np.floor(column).astype(int) % SKIRT_COLUMNS
@@ -206,7 +214,10 @@ def skirt_sheets(
     flare: float,
     pleats: tuple[int, float],
 ) -> list[Patch]:
-    """A skirt, outside and inside. It follows the hips, then widens by `flare` metres per metre; pleats (count, m)."""
+    """Make the outside and inside of a skirt: it follows the hips, then widens by `flare` metres per metre.
+
+    `pleats` are their number and depth in metres.
+    """
     rows = 34
     y = np.broadcast_to(np.linspace(hem_y, waist_y, rows)[:, None], (rows, len(around)))
     theta = np.broadcast_to(around, y.shape)
@@ -226,13 +237,13 @@ def skirt_sheets(
     shade = 1 + 8 * pleats[1] * np.cos(pleats[0] * turn) * (1 - canvas.y / canvas.height_m)
     chart = np.clip(painter(canvas) * np.clip(shade, 0.65, 1.15)[..., None], 0, 1)
     weights = skirt_weights(body, points, theta)
-    sheet = Patch(points, uv, weights, chart, closed=_closed(around))
+    sheet = Patch(points, uv, weights, chart, closed=_is_closed(around))
     return two_sided(sheet, points - 0.005 * outward, 0.45)
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """A top, what covers the legs, perhaps something over both, and shoes."""
+    """A top, clothes for the legs, perhaps a jacket or coat, and shoes."""
 
     top: str
     bottom: str
@@ -247,7 +258,7 @@ class Outfit:
 
     @property
     def words(self) -> str:
-        """The outfit in words."""
+        """The outfit as text."""
         lower = "" if self.bottom == "dress" else f" and {self.fabrics[1].kind} {self.bottom}"
         upper = "dress" if self.bottom == "dress" else self.top
         outer = "" if self.outer == "none" else f" under a {self.outer}"
@@ -255,7 +266,7 @@ class Outfit:
 
 
 def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
-    """Draw an outfit."""
+    """Sample an outfit."""
     odds = (
         [0.26, 0.22, 0.12, 0.08, 0.12, 0.11, 0.09]
         if femininity > 0.5
@@ -277,7 +288,10 @@ def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
 
 @dataclass(frozen=True)
 class Cut:
-    """The measures of an outfit: metres of ease, shares of the height for hems, shares of the limb for sleeves."""
+    """The measures of an outfit.
+
+    Ease is in metres, hems are fractions of the height, sleeves fractions of the limb.
+    """
 
     loose_m: float
     hang: float
@@ -288,13 +302,13 @@ class Cut:
     ease_m: float
     leg: float
     cuff: float
-    """Where the skin of the arm shows from: the end of the longest sleeve."""
+    """Position along the arm from which skin shows: the end of the longest sleeve."""
     leg_hang: float
     leg_flare_m: float
 
 
 def sample_cut(outfit: Outfit) -> Cut:
-    """Draw the measures that suit these garments."""
+    """Sample measures that suit these garments."""
     rng = np.random.default_rng(outfit.seed)
     loose = {"sweater": 0.014, "shirt": 0.010, "t-shirt": 0.009}.get(outfit.top, 0.004) + 0.006 * rng.random()
     sleeve = {"t-shirt": rng.uniform(0.2, 0.42), "tank top": 0.0}.get(outfit.top, rng.uniform(0.94, 1.0))
@@ -324,7 +338,7 @@ def sample_cut(outfit: Outfit) -> Cut:
 def neckline(
     around: Azimuths, height_m: float, depth: float, vee: bool = False, wide: float = 0.0
 ) -> Azimuths:
-    """Heights of a neckline in metres: `depth` (share of the height) lower in front, round or V-shaped."""
+    """Heights of a neckline in metres, round or V-shaped, lower in front by `depth` (of the height)."""
     turn = np.abs(np.angle(np.exp(1j * around)))
     dip = np.clip(1 - turn / 0.75, 0, 1) if vee else np.exp(-((turn / 0.85) ** 2))
     return (0.836 - wide - depth * dip) * height_m
@@ -339,30 +353,30 @@ class Tailor:
     cut: Cut
 
     def folds(self, depth_m: float, along_m: float, around_m: float, number: int) -> Folds:
-        """Creases with a seed of their own."""
+        """Creases with their own seed."""
         return Folds(depth_m, along_m, around_m, self.outfit.seed % 100_000 + 17 * number)
 
     def lower_shape(self) -> Body:
-        """The body in what covers the legs."""
+        """The body with trousers, leggings, shorts or a skirt."""
         body = self.body
         cut = self.cut
-        legs = tuple(leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs)
-        return replace(body, torso=body.torso.eased(min(cut.ease_m, 0.006) - 0.001), legs=legs)
+        legs = tuple(leg.loosen(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs)
+        return replace(body, torso=body.torso.loosen(min(cut.ease_m, 0.006) - 0.001), legs=legs)
 
     def _trunk(self, under: Torso) -> Torso:
-        """The trunk in the top, over what is tucked into it."""
-        return self.body.torso.eased(self.cut.loose_m, self.cut.hang, 0.004).outside(under, 0.005)
+        """The trunk with the top, over what is tucked into it."""
+        return self.body.torso.loosen(self.cut.loose_m, self.cut.hang, 0.004).widen_around(under, 0.005)
 
     def top(self) -> list[Patch]:
-        """Shirt, sweater or the like: trunk and sleeves."""
+        """Make the top: trunk and sleeves."""
         H = self.body.height_m
         outfit = self.outfit
         body = self.body
         cut = self.cut
         lower = self.lower_shape()
         hang, flare = (0.10, 0.012) if cut.sleeve < 0.7 else (0.62, -0.006)
-        arms = tuple(arm.eased(cut.loose_m + 0.003, hang, flare) for arm in body.arms)
-        legs = tuple(leg.eased(0.004) for leg in lower.legs)
+        arms = tuple(arm.loosen(cut.loose_m + 0.003, hang, flare) for arm in body.arms)
+        legs = tuple(leg.loosen(0.004) for leg in lower.legs)
         shape = replace(body, torso=self._trunk(lower.torso), arms=arms, legs=legs)
         around = azimuths(65)
         high = neckline(around, H, cut.neck, cut.vee, 0.008 if outfit.top == "tank top" else 0.0)
@@ -402,7 +416,7 @@ class Tailor:
         return blend(image, 0.7 * image, edge(0.0015 - np.abs(canvas.y - 0.02), canvas))
 
     def bottom(self) -> list[Patch]:
-        """Trousers, shorts or skirt."""
+        """Make trousers, shorts or a skirt."""
         H = self.body.height_m
         cut = self.cut
         kind = self.outfit.bottom
@@ -449,12 +463,12 @@ class Tailor:
         hem = float(rng.uniform(0.17, 0.36))
         flare = float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
-        shape = replace(body, torso=body.torso.eased(0.014))
+        shape = replace(body, torso=body.torso.loosen(0.014))
         waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
         return skirt_sheets(self.body, shape, waist * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
 
     def outer(self) -> list[Patch]:
-        """Jacket or coat, open in front."""
+        """Make a jacket or coat, open in front."""
         H = self.body.height_m
         outfit = self.outfit
         body = self.body
@@ -462,10 +476,10 @@ class Tailor:
             return []
         rng = np.random.default_rng(outfit.seed + 2)
         ease = float(rng.uniform(0.026, 0.034))
-        torso = body.torso.eased(ease, float(rng.uniform(0.5, 0.9)))
-        torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
+        torso = body.torso.loosen(ease, float(rng.uniform(0.5, 0.9)))
+        torso = torso.widen_around(self._trunk(self.lower_shape().torso), 0.012)
         shape = replace(
-            body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms)
+            body, torso=torso, arms=tuple(arm.loosen(ease - 0.004, 0.55, -0.004) for arm in body.arms)
         )
         around = azimuths(65, float(rng.uniform(0.12, 0.4)))
         coat = outfit.outer == "coat"
@@ -489,7 +503,7 @@ class Tailor:
         return blend(image, 0.6 * image, edge(0.002 - np.abs(front - 0.03), canvas))
 
     def skin(self, person: Physique, rng: np.random.Generator) -> list[Patch]:
-        """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
+        """Make the bare skin: neck, shoulders, arms, legs and hands; covered parts stay inside the cloth."""
         H = person.height_m
         body = self.body
         cut = self.cut
@@ -517,7 +531,7 @@ class Tailor:
 
 
 def lining(sheet: Patch) -> Patch:
-    """The inside of an open sheet near its front edges: a dark copy a few millimetres within, turned round."""
+    """Make the inside of an open sheet near its front edges: a dark copy a few millimetres within."""
     inside = sheet.points[:, ::-1].copy()
     center = inside.mean(1, keepdims=True)
     inside = center + 0.975 * (inside - center)

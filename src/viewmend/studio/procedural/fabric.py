@@ -1,4 +1,4 @@
-"""Cloth as paint, in metres on a flat chart; and the charts of a performer, assembled into one mesh and one atlas."""
+"""Paints cloth on flat charts, in metres, and assembles a performer's charts into one mesh and one atlas."""
 
 import colorsys
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ KINDS = (
     *("flowers", "blobs", "gradient", "zigzag", "denim", "knit", "letters"),
 )
 QUIET = ("plain", "heather", "denim", "knit", "stripes", "gradient", "bands")
-"""Kinds that leave room for a word across the chest."""
+"""Kinds of cloth that leave room for a word across the chest."""
 PRINTED = ("bands", "dots", "flowers", "blobs", "gradient", "zigzag", "letters")
 Image = Float[np.ndarray, "height width 3"]
 Plane = Float[np.ndarray, "height width"]
@@ -44,7 +44,7 @@ ATLAS_GUTTER_PX = 3
 
 @dataclass(frozen=True)
 class Canvas:
-    """A chart's texels in metres: x to the right with 0 in the middle (the front), y up from the lower edge."""
+    """The texels of a chart in metres: x to the right from the middle (front), y up from the lower edge."""
 
     width_m: float
     height_m: float
@@ -68,7 +68,7 @@ class Canvas:
         return np.broadcast_to((np.linspace(1, 0, rows) * self.height_m)[:, None], (rows, columns))
 
     def noise(self, rng: np.random.Generator, cell_x_m: float, cell_y_m: float) -> Plane:
-        """Smooth noise of about unit variance whose grains have this size."""
+        """Make smooth noise of about unit variance, with grains of this size."""
         rows, columns = self.shape
         coarse = (max(2, round(self.height_m / cell_y_m) + 1), max(2, round(self.width_m / cell_x_m) + 1))
         values = rng.standard_normal(coarse)
@@ -78,7 +78,7 @@ class Canvas:
 
 
 def hsv(h: float, s: float, v: float) -> Vector:
-    """SRGB of a hue, saturation and value, each in [0, 1]."""
+    """Convert hue, saturation and value, each in [0, 1], to sRGB."""
     return np.array(colorsys.hsv_to_rgb(h % 1.0, min(max(s, 0), 1), min(max(v, 0), 1)))
 
 
@@ -92,16 +92,16 @@ class Fabric:
     seed: int
 
     def paint(self, canvas: Canvas) -> Image:
-        """The cloth laid flat on this canvas."""
+        """Paint the cloth on a flat canvas."""
         rng = np.random.default_rng(self.seed)
         flat = np.broadcast_to(self.colors[0], (*canvas.shape, 3)).astype(np.float64)
-        image = (_printed if self.kind in PRINTED else _woven)(flat, self, canvas, rng)
+        image = (_print_pattern if self.kind in PRINTED else _weave_pattern)(flat, self, canvas, rng)
         weave = 1 + 0.025 * rng.standard_normal(canvas.shape)
         return np.clip(image * weave[..., None], 0, 1)
 
 
 def sample_fabric(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> Fabric:
-    """Draw a cloth among these kinds."""
+    """Sample a cloth of these kinds."""
     quiet = tuple(k for k in kinds if k in QUIET)
     pool = quiet if quiet and rng.random() < 0.3 else kinds
     kind = pool[int(rng.integers(len(pool)))]
@@ -120,7 +120,7 @@ def sample_fabric(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> F
 
 
 def blend(base: Image, color: Vector | Image, alpha: Plane) -> Image:
-    """`color` over `base` with coverage `alpha`."""
+    """Composite `color` over `base` with coverage `alpha`."""
     return base + np.clip(alpha, 0, 1)[..., None] * (color - base)
 
 
@@ -135,8 +135,8 @@ def wave(position_m: Plane, period_m: float, share: float, canvas: Canvas) -> Pl
     return edge((phase - 0.5 + share / 2) * period_m, canvas)
 
 
-def _woven(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    """Cloth whose pattern is that of its threads, painted on an image of its first colour."""
+def _weave_pattern(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    """Weave the fabric's pattern into an image of its first colour."""
     x = canvas.x
     y = canvas.y
     period = fabric.period_m
@@ -167,8 +167,8 @@ def _woven(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generato
     return image
 
 
-def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    """Cloth with a print on an image of its first colour."""
+def _print_pattern(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    """Print the fabric's pattern on an image of its first colour."""
     x = canvas.x
     y = canvas.y
     period = fabric.period_m
@@ -185,7 +185,7 @@ def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
             distance = period * np.hypot(across, (y / period) % 1.0 - 0.5)
             image = blend(image, second, edge(radius - distance, canvas))
         case "flowers":
-            image = _flowers(image, fabric, canvas, rng)
+            image = _print_flowers(image, fabric, canvas, rng)
         case "blobs":
             cell = period * 0.9
             for color, level in ((second, 0.2), (third, 0.6)):
@@ -206,7 +206,7 @@ def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
     return image
 
 
-def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+def _print_flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
     # Bytes are the only depth that OpenCV draws smooth edges in.
     flat = np.ascontiguousarray((255 * image).astype(np.uint8))
     rows, columns = canvas.shape
@@ -232,7 +232,7 @@ def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
 def write(
     image: Image, canvas: Canvas, word: str, color: Vector, at_m: tuple[float, float], width_m: float
 ) -> Image:
-    """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
+    """Write a word of this width, at most 9 cm tall, centred at a position of the canvas."""
     font = cv2.FONT_HERSHEY_DUPLEX
     thick = max(2, round(0.05 * width_m * canvas.px_per_m))
     (wide, tall), _ = cv2.getTextSize(word, font, 1.0, 1)
@@ -255,9 +255,9 @@ class Patch:
     chart: Float[np.ndarray, "height width 3"]
     """sRGB in [0, 1], top row first."""
     keep: Bool[np.ndarray, "row column"] | None = None
-    """A face goes where none of its corners is kept."""
+    """Vertices to keep; faces all of whose vertices are dropped are removed."""
     closed: bool = True
-    """The last column repeats the first (the normals must agree)."""
+    """Whether the last column repeats the first, so that their normals must agree."""
 
 
 def outward_of(azimuth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
@@ -266,14 +266,14 @@ def outward_of(azimuth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
 
 
 def two_sided(outside: Patch, inside: Float[np.ndarray, "row column 3"], shade: float) -> list[Patch]:
-    """An open sheet and its other side at the points `inside`: in one colour, `shade` times the chart's mean."""
+    """Make an open sheet and its other side at `inside`, in `shade` times the chart's mean colour."""
     dark = np.broadcast_to(shade * outside.chart.mean((0, 1)), (8, 8, 3))
     back = Patch(inside[:, ::-1], outside.uv[:, ::-1], outside.weights[:, ::-1], dark, closed=outside.closed)
     return [outside, back]
 
 
 def assemble(patches: list[Patch]) -> BoundMesh:
-    """One mesh and one atlas out of all patches."""
+    """Assemble all patches into one mesh and one atlas."""
     offsets, atlas = pack_charts([patch.chart for patch in patches])
     height, width = atlas.shape[:2]
     faces = []
@@ -281,7 +281,7 @@ def assemble(patches: list[Patch]) -> BoundMesh:
     uvs = []
     first = 0
     for patch, (left, top) in zip(patches, offsets, strict=True):
-        triangles = _shown_faces(patch)
+        triangles = _visible_faces(patch)
         normals.append(_grid_normals(patch, triangles).reshape(-1, 3))
         chart_height, chart_width = patch.chart.shape[:2]
         u = (left + 0.5 + patch.uv[..., 0] * (chart_width - 1)) / width
@@ -311,8 +311,8 @@ def _float(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
 
-def _shown_faces(patch: Patch) -> Int[np.ndarray, "face 3"]:
-    """Two triangles for each kept cell of a grid, counter-clockwise from outside; none that are a line or a point."""
+def _visible_faces(patch: Patch) -> Int[np.ndarray, "face 3"]:
+    """Make two triangles for each kept cell of a grid, counter-clockwise from outside, none degenerate."""
     rows, columns = patch.points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (
@@ -335,7 +335,7 @@ def _grid_normals(patch: Patch, triangles: Int[np.ndarray, "face 3"]) -> Float[n
 
 
 def pack_charts(charts: list[Float[np.ndarray, "_ _ 3"]]) -> tuple[list[tuple[int, int]], Image]:
-    """Shelve the charts in one near-square image: (left, top) of each in pixels, and the image.
+    """Pack the charts on shelves of one near-square image; returns each chart's (left, top), and the image.
 
     Each chart is framed by a gutter that repeats its edge, so that sampling near an edge never
     reaches a neighbour.

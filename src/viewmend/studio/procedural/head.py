@@ -1,4 +1,4 @@
-"""Head, face and hair: one surface of rings with features, painted; hair is the same surface, thicker."""
+"""Draws head, face and hair: the head is one painted surface of rings; hair is the same surface, thicker."""
 
 from dataclasses import dataclass, replace
 
@@ -11,15 +11,15 @@ from viewmend.studio.procedural.skeleton import TABLES, Physique, Points, Skelet
 
 RINGS = np.array(TABLES["head"])
 HEAD_SHARE = 0.132
-"""The head's height as a share of the person's (7.6 heads)."""
+"""Height of the head as a fraction of the person's (7.6 heads)."""
 EYE_AZIMUTH = 0.37
-"""The eyes are at this angle from the middle of the face, radians, to either side."""
+"""Angle of the eyes from the middle of the face, radians, to either side."""
 EYE_Y = 0.495
-"""The eyes are at this share of the head's height."""
+"""Height of the eyes as a fraction of the head's."""
 
 
 def _spot(turn: Values, y: Values, at: float, height: float, wide: float, tall: float) -> Values:
-    """1 at a place of the face, and less around it."""
+    """A bump on the face: 1 at its centre, and less around it."""
     return np.exp(-(((turn - at) / wide) ** 2) - ((y - height) / tall) ** 2)
 
 
@@ -65,7 +65,7 @@ class Head:
 
 
 def build_head(person: Physique, skeleton: Skeleton) -> Head:
-    """This person's head, in the bind pose."""
+    """Build a person's head in the bind pose."""
     size = HEAD_SHARE * person.height_m
     neck = skeleton.at("head")
     return Head(person, np.array([0.0, person.height_m - size, neck[2] + 0.012]), size)
@@ -74,7 +74,7 @@ def build_head(person: Physique, skeleton: Skeleton) -> Head:
 def face_grid(
     rows: int, columns: int
 ) -> tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"]]:
-    """Azimuths and heights of a grid over the head, denser on the face."""
+    """Make the azimuths and heights of a grid over the head, denser on the face."""
     c = np.linspace(-1, 1, columns)
     azimuth = np.pi * (0.55 * c + 0.45 * c**3)
     h = np.linspace(0, 1, rows)
@@ -84,7 +84,7 @@ def face_grid(
 
 
 def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rgb: Vector) -> list[Patch]:
-    """The head with its painted face, and two ears."""
+    """Draw the head with its painted face, and two ears."""
     azimuth, y = face_grid(68, 73)
     points = head.point(azimuth, y)
     canvas = Canvas(0.56, head.size_m, 1000.0)
@@ -108,7 +108,7 @@ def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rg
 
 
 def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_rgb: Vector) -> Image:
-    """Skin with eyes, brows, mouth, cheeks, nostrils, and stubble on some."""
+    """Paint skin with eyes, brows, mouth, cheeks, nostrils, and sometimes stubble."""
     theta = canvas.x / canvas.width_m * 2 * np.pi
     y = canvas.y / canvas.height_m
     turn = np.abs(theta)
@@ -167,17 +167,17 @@ class Hair:
     style: str
     color: Vector
     volume: float
-    """0 to 1."""
+    """Volume from 0 to 1."""
     seed: int
 
     @property
     def words(self) -> str:
-        """The hair in words."""
+        """The hair as text."""
         return {"bald": "bald", "cap": "in a cap"}.get(self.style, f"{self.style} hair")
 
 
 def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) -> Hair:
-    """Draw a hairstyle; colours over the human range, dark ones on dark skin."""
+    """Sample a hairstyle; colours cover the human range, dark ones on dark skin."""
     styles = list(TABLES["hair"])
     odds = [row[femininity > 0.5] for row in TABLES["hair"].values()]
     style = styles[int(rng.choice(len(styles), p=odds))]
@@ -188,7 +188,7 @@ def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) ->
 
 
 def strands(hair: Hair, canvas: Canvas) -> Image:
-    """Hair as paint: streaks that run down, lighter and darker."""
+    """Paint hair: streaks that run down, lighter and darker."""
     rng = np.random.default_rng(hair.seed)
     tight = hair.style in ("afro", "cropped", "bald")
     streaks = canvas.noise(rng, 0.004, 0.006 if tight else 0.10)
@@ -197,7 +197,7 @@ def strands(hair: Hair, canvas: Canvas) -> Image:
 
 
 def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[Patch]:
-    """All sheets of this hairstyle."""
+    """Make all sheets of this hairstyle."""
     if hair.style == "bald" and hair.volume < 0.5:
         return []
     rng = np.random.default_rng(hair.seed + 1)
@@ -228,7 +228,7 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[P
     if hair.style in ("bob", "long"):
         patches += _curtain(head, hair, torso, chart, thick)
     if hair.style in ("ponytail", "bun"):
-        patches.append(_tied(head, hair, chart))
+        patches.append(_gather_hair(head, hair, chart))
     if hair.style == "cap":
         patches.append(_brim(head, chart))
         patches += hair_patches(head, replace(hair, style="cropped"), torso, accent)
@@ -236,7 +236,7 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[P
 
 
 def _curtain(head: Head, hair: Hair, torso: Torso, chart: Image, thick: float) -> list[Patch]:
-    """Hair that falls behind the face to the neck or over the back, outside and inside."""
+    """Make hair that falls behind the face to the neck or over the back, outside and inside."""
     low = -0.05 + 0.12 * hair.volume if hair.style == "bob" else -0.35 - 0.75 * hair.volume
     opening = 1.12 + 0.15 * (hair.style == "long")
     theta, y = np.meshgrid(np.linspace(opening, 2 * np.pi - opening, 49), np.linspace(low, 0.86, 32))
@@ -256,8 +256,8 @@ def _curtain(head: Head, hair: Hair, torso: Torso, chart: Image, thick: float) -
     return two_sided(Patch(points, uv, weights, chart, closed=False), points - 0.012 * outward, 0.5)
 
 
-def _tied(head: Head, hair: Hair, chart: Image) -> Patch:
-    """A ponytail or a bun behind the crown."""
+def _gather_hair(head: Head, hair: Hair, chart: Image) -> Patch:
+    """Make a ponytail or a bun behind the crown."""
     v, phi = np.meshgrid(np.linspace(0, 1, 24), np.linspace(-np.pi, np.pi, 17), indexing="ij")
     start = head.origin + head.size_m * np.array([0, 0.80, -0.44])
     uv = np.stack([(phi / np.pi + 1) / 2, v], -1)
@@ -283,7 +283,7 @@ def _tied(head: Head, hair: Hair, chart: Image) -> Patch:
 
 
 def _brim(head: Head, chart: Image) -> Patch:
-    """The peak of a cap."""
+    """Make the peak of a cap."""
     phi, v = np.meshgrid(np.linspace(-np.pi, np.pi, 33), np.linspace(-1, 1, 9))
     across = np.sqrt(np.clip(1 - v**2, 0, 1))
     x = 0.31 * np.sin(phi) * across

@@ -40,14 +40,14 @@ second."""
 
 
 def ease(x: float) -> float:
-    """0 below 0, 1 above 1, with level ends and level curvature."""
+    """Ease from 0 to 1, with zero slope and curvature at both ends."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (10 - 15 * x + 6 * x * x)
 
 
 @dataclass(frozen=True)
 class Score:
-    """What a seed fixes of a motion below the shoulders."""
+    """The seeded parameters of a motion below the shoulders."""
 
     kind: str
     tempo: Tempo
@@ -66,7 +66,7 @@ class Score:
         return rotation(1, self.heading)
 
     def rest(self, width: float, drop: float, ahead_m: float = 0.0) -> Stance:
-        """Standing with the feet `width` apart and the pelvis `drop` lower than at rest (shares of the height)."""
+        """A stance with feet `width` apart and the pelvis `drop` lower (both relative to the height)."""
         H = self.height_m
         place = ahead_m * (self.turn @ np.array([0, 0, 1.0]))
         sides = [(s, place + self.turn @ np.array([s * width * H / 2, 0, 0])) for s in SIGN.values()]
@@ -76,7 +76,7 @@ class Score:
 
 
 def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
-    """Where the body's middle is on the floor (x, z), and where it is heading."""
+    """The body's position on the floor (x, z) and its heading."""
     if score.kind in ("walk", "run") and score.path_m > 0.15:
         speed = (0.42 if score.kind == "walk" else 0.55) * score.beat_hz * score.height_m
         angle = speed * time_s / score.path_m + score.heading
@@ -93,8 +93,8 @@ def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
     return np.zeros(2), score.heading
 
 
-def _stepping(score: Score, time_s: float, beats: float) -> Stance:
-    """Feet that step along the path: planted, lifted, swung to where the body will be."""
+def _step(score: Score, time_s: float, beats: float) -> Stance:
+    """Step along the path: each foot is planted, lifted, and swung to where the body will be."""
     H = score.height_m
     run = score.kind == "run"
     duty = 0.42 if run else 0.62
@@ -141,8 +141,8 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-def _standing(score: Score, time_s: float, beats: float) -> Stance:
-    """Talking or swaying: planted feet, weight that shifts, breath."""
+def _stand(score: Score, time_s: float, beats: float) -> Stance:
+    """Stand while talking or swaying: planted feet, shifting weight, breath."""
     a = score.amounts
     H = score.height_m
     calm = score.tempo == "calm"
@@ -172,8 +172,8 @@ def _standing(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-def _jumping(score: Score, time_s: float, beats: float) -> Stance:
-    """Jumping jacks: feet and arms open and close, with a hop between."""
+def _jump(score: Score, time_s: float, beats: float) -> Stance:
+    """Do jumping jacks: feet and arms open and close, with a hop between."""
     H = score.height_m
     base = score.rest(0.0, 0.02)
     open_ = 0.5 + 0.5 * np.sin(2 * np.pi * beats)
@@ -185,8 +185,8 @@ def _jumping(score: Score, time_s: float, beats: float) -> Stance:
     return replace(base, pelvis=base.pelvis + np.array([0, 0.9 * hop - 0.04 * H * open_, 0]), feet=feet)
 
 
-def _crouching(score: Score, time_s: float, beats: float) -> Stance:
-    """Down on bent knees and up again."""
+def _crouch(score: Score, time_s: float, beats: float) -> Stance:
+    """Crouch down and stand up again."""
     H = score.height_m
     a = score.amounts
     base = score.rest(0.16 + 0.06 * a[0], 0.015)
@@ -203,8 +203,8 @@ def _crouching(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-def _sitting(score: Score, time_s: float, beats: float) -> Stance:
-    """Sitting on a stool at the centre; some get up and sit down again."""
+def _sit(score: Score, time_s: float, beats: float) -> Stance:
+    """Sit on a stool at the centre; some stand up and sit down again."""
     H = score.height_m
     a = score.amounts
     forward = score.turn @ np.array([0, 0, 1.0])
@@ -226,8 +226,8 @@ def _sitting(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-def _reaching(score: Score, time_s: float, beats: float) -> Stance:
-    """Hands that go from one place to the next: up, aside, forward, to the floor."""
+def _reach(score: Score, time_s: float, beats: float) -> Stance:
+    """Reach with the hands from one place to the next: up, aside, forward, to the floor."""
     H = score.height_m
     a = score.amounts
     base = score.rest(0.18, 0.03)
@@ -253,7 +253,7 @@ def _reaching(score: Score, time_s: float, beats: float) -> Stance:
 
 
 def _goal(score: Score, step: int) -> Float[np.ndarray, "side 3"]:
-    """Places of both wrists in the heading's frame, shares of the height; the hands often go together."""
+    """Positions of both wrists in the heading's frame, relative to the height; often they move together."""
     rng = np.random.default_rng([int(1e6 * score.amounts[5]), step % 1000])
     places = np.array(TABLES["reaches"])
     down = np.array([0.17, 0.47, 0.05])
@@ -268,13 +268,13 @@ def _goal(score: Score, step: int) -> Float[np.ndarray, "side 3"]:
     return np.stack([left, right]) + rng.uniform(-0.03, 0.03, (2, 3))
 
 
-GROUNDS = {
-    **dict.fromkeys(("walk", "run", "march", "turn", "spin", "sidestep"), _stepping),
-    **dict.fromkeys(("talk", "sway", "groove", "box", "lunge"), _standing),
-    "jacks": _jumping,
-    "crouch": _crouching,
-    "sit": _sitting,
-    "reach": _reaching,
+STANCES = {
+    **dict.fromkeys(("walk", "run", "march", "turn", "spin", "sidestep"), _step),
+    **dict.fromkeys(("talk", "sway", "groove", "box", "lunge"), _stand),
+    "jacks": _jump,
+    "crouch": _crouch,
+    "sit": _sit,
+    "reach": _reach,
 }
 
 
@@ -288,7 +288,7 @@ class Gesture:
     harmonics: Float[np.ndarray, "side"]
 
     def angles(self, beats: float) -> Float[np.ndarray, "side angle"]:
-        """Flexion, abduction, twist, elbow, curl of both arms at this point of the music."""
+        """Flexion, abduction, twist, elbow and curl of both arms at this beat."""
         moving = self.bases + self.amplitudes * np.sin(
             2 * np.pi * (self.harmonics[:, None] * beats + self.phases)
         )
@@ -299,7 +299,7 @@ class Gesture:
 def sample_gesture(
     rng: np.random.Generator, kinds: list[str], bulk: float, energy: float, beat_hz: float
 ) -> Gesture:
-    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes."""
+    """Sample a gesture; `bulk` (radians) keeps hanging arms off the body, `energy` scales amplitudes."""
     first = kinds[int(rng.integers(len(kinds)))]
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
@@ -333,12 +333,12 @@ class Motion:
     """Rate at which the two gestures alternate."""
     center: tuple[float, float]
     grip: str | None = None
-    """The side whose hand is closed round something."""
+    """The side whose hand holds something."""
 
     def stance(self, time_s: float) -> Stance:
-        """The body at this time."""
+        """Compute the body's stance at this time."""
         beats = self.score.beat_hz * time_s + float(self.score.amounts[7])
-        stance = GROUNDS[self.score.kind](self.score, time_s, beats)
+        stance = STANCES[self.score.kind](self.score, time_s, beats)
         a, b, c = 6 * self.score.amounts[:3]
         look = 0.45 * np.sin(0.9 * time_s + a) * np.sin(0.37 * time_s + b)
         strong = 0.03 if self.score.tempo == "calm" else 0.10
@@ -375,7 +375,7 @@ def sample_motion(
     bulk: float,
     center: tuple[float, float] = (0.0, 0.0),
 ) -> Motion:
-    """Draw a motion of this tempo; `kind` fixes which."""
+    """Sample a motion of this tempo; `kind` fixes which."""
     chosen = kind or MOTIONS[tempo][int(rng.integers(len(MOTIONS[tempo])))]
     beat = float(rng.uniform(*BEAT_HZ[tempo]))
     if chosen in OWN_BEAT_HZ:

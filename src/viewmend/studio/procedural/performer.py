@@ -1,4 +1,4 @@
-"""Performers and scenes drawn from a seed."""
+"""Samples performers and scenes by seed."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ from viewmend.studio.procedural.props import HELD, STANDING, held_prop, standing
 from viewmend.studio.procedural.skeleton import SIDES, Physique, Skeleton, build_skeleton, sample_physique
 
 LAG_S = 0.12
-"""Skirts and hair follow where the body was this long ago."""
+"""Skirts and hair lag behind the body by this many seconds."""
 BUSY_HANDS = ("jacks", "box", "reach", "run")
 ROAMING = ("walk", "run", "sidestep")
 """Motions that need the floor to themselves."""
@@ -37,7 +37,7 @@ class ProceduralPerson:
         now = self.motion.stance(time_s)
         before = self.motion.stance(time_s - LAG_S)
         transforms = torch.from_numpy(now.solve(self.skeleton, before, LAG_S)).float()
-        return self.bound.posed(transforms)
+        return self.bound.skin(transforms)
 
 
 def draw_person(
@@ -47,7 +47,10 @@ def draw_person(
     holding: bool | None,
     center: tuple[float, float],
 ) -> ProceduralPerson:
-    """Draw a person. `kind` fixes the motion, `holding` whether something is in a hand; `center` is x and z, metres."""
+    """Sample a person. `kind` fixes the motion, `holding` whether a hand holds something.
+
+    `center` is x and z, metres.
+    """
     body_rng, cloth_rng, hair_rng, motion_rng, prop_rng = (np.random.default_rng(s) for s in seeds.spawn(5))
     person = sample_physique(body_rng)
     outfit = sample_outfit(cloth_rng, person.femininity)
@@ -79,14 +82,14 @@ def draw_person(
 
 @dataclass(frozen=True)
 class ProceduralPerformer:
-    """One or two people and what stands around them. `pose` keeps nothing between calls."""
+    """One or two people and the objects around them. `pose` keeps no state between calls."""
 
     people: tuple[ProceduralPerson, ...]
     things: TexturedMesh | None
     description: str
 
     def pose(self, time_s: float) -> TexturedMesh:
-        """All of them at this time, in seconds, as one mesh; their textures stay separate."""
+        """All people and objects at this time, in seconds, as one mesh; their textures stay separate."""
         parts = [person.pose(time_s) for person in self.people]
         if self.things is not None:
             parts.append(self.things)
@@ -111,7 +114,7 @@ class ProceduralPerformer:
 
 @dataclass(frozen=True, kw_only=True)
 class PerformerStyle:
-    """What of a performer or scene is fixed; None leaves it to the seed."""
+    """The properties of a performer or scene that are fixed; None leaves them to the seed."""
 
     tempo: Tempo | None = None
     motion: str | None = None
@@ -119,13 +122,13 @@ class PerformerStyle:
     people: int | None = None
     """1 or 2, for scenes."""
     holding: bool | None = None
-    """Whether something is held in a hand."""
+    """Whether a hand holds something."""
     furniture: bool | None = None
-    """Whether things stand around, for scenes (who sits has a stool anyway)."""
+    """Whether objects stand around, for scenes; a sitting person always has a stool."""
 
 
 def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
-    """One or two clothed people in motion around the stage's centre, perhaps with things in their hands and around.
+    """Sample one or two clothed people in motion around the stage's centre, perhaps with objects.
 
     The same seed and style give the same scene, bit for bit.
 
@@ -167,7 +170,7 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
 
 
 def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
-    """One or two things on the floor, off the line through two people."""
+    """Put one or two objects on the floor, off the line through two people."""
     patches = []
     names = []
     for i in range(int(rng.integers(1, 3))):

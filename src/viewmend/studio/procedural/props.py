@@ -1,4 +1,4 @@
-"""Things: held in a hand, or standing on the floor."""
+"""Makes objects that a hand holds, or that stand on the floor."""
 
 from dataclasses import dataclass, replace
 
@@ -15,53 +15,53 @@ STANDING = ("crate", "plant", "lamp", "ball", "suitcase", "table", "stool")
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a thing is in the bind pose or the world, and the joint it follows."""
+    """Position and axes of an object in the bind pose or the world, and the joint that it follows."""
 
     origin: Vector
     axes: Rotation
-    """Columns: the thing's x, y (up) and z."""
+    """Axes of the object as columns: x, y (up) and z."""
     joint: str = "pelvis"
 
-    def moved(self, x: float, y: float, z: float) -> "Frame":
-        """The frame at a place in its own coordinates, metres."""
+    def offset_by(self, x: float, y: float, z: float) -> "Frame":
+        """The frame at an offset in its own coordinates, metres."""
         return replace(self, origin=self.origin + self.axes @ np.array([x, y, z]))
 
     def patch(self, local: Float[np.ndarray, "row column 3"], chart: Image, closed: bool = True) -> Patch:
-        """A sheet given in the thing's own coordinates."""
+        """Make a sheet from points in the object's own coordinates."""
         points = local @ self.axes.T + self.origin
         return Patch(
             points, unit_grid(local.shape), one_joint(local.shape[:2], self.joint), chart, closed=closed
         )
 
 
-def turned_solid(frame: Frame, r: Values, y: Values, chart: Image, columns: int = 29) -> Patch:
-    """A solid of revolution about y, from radii at heights that go up; repeated ones make sharp edges."""
+def solid_of_revolution(frame: Frame, r: Values, y: Values, chart: Image, columns: int = 29) -> Patch:
+    """Make a solid of revolution around y from radii at rising heights; repeated heights make sharp edges."""
     phi = np.linspace(-np.pi, np.pi, columns)
     x = r[:, None] * np.sin(phi)
     z = r[:, None] * np.cos(phi)
     return frame.patch(np.stack([x, np.broadcast_to(y[:, None], x.shape), z], -1), chart)
 
 
-def profiled(frame: Frame, name: str, chart: Image, size_m: float = 0.0, columns: int = 29) -> Patch:
-    """A solid of one of the profiles in the tables."""
+def profile_solid(frame: Frame, name: str, chart: Image, size_m: float = 0.0, columns: int = 29) -> Patch:
+    """Make a solid of revolution from a profile in the tables."""
     r, y, share = np.array(TABLES["profiles"][name]).T
-    return turned_solid(frame, r, y + share * size_m, chart, columns)
+    return solid_of_revolution(frame, r, y + share * size_m, chart, columns)
 
 
 def cylinder(frame: Frame, radius: float, height: float, chart: Image) -> Patch:
-    """A closed cylinder with sharp rims."""
+    """Make a closed cylinder with sharp rims."""
     r, y = np.array([(0, 0), (radius, 0), (radius, 0), (radius, height), (radius, height), (0, height)]).T
-    return turned_solid(frame, r, y, chart, 17)
+    return solid_of_revolution(frame, r, y, chart, 17)
 
 
 def ball(frame: Frame, radius: float, chart: Image) -> Patch:
-    """A sphere on its lowest point."""
+    """Make a sphere that stands on its lowest point."""
     polar = np.linspace(-np.pi / 2, np.pi / 2, 17)
-    return turned_solid(frame, radius * np.cos(polar), radius * (1 + np.sin(polar)), chart, 25)
+    return solid_of_revolution(frame, radius * np.cos(polar), radius * (1 + np.sin(polar)), chart, 25)
 
 
 def box(frame: Frame, size: tuple[float, float, float], chart: Image) -> list[Patch]:
-    """Six sides, each with the whole chart; x and z are centred, y starts at 0."""
+    """Make six sides, each with the whole chart; x and z are centred, y starts at 0."""
     w = size[0] / 2
     h = size[1]
     d = size[2] / 2
@@ -76,7 +76,7 @@ def box(frame: Frame, size: tuple[float, float, float], chart: Image) -> list[Pa
 
 
 def plain_chart(color: Vector) -> Image:
-    """One colour."""
+    """Make a chart of one colour."""
     return np.broadcast_to(color, (8, 8, 3)).astype(np.float64)
 
 
@@ -98,21 +98,21 @@ def _print(rng: np.random.Generator, width: float, height: float) -> Image:
 
 
 def stool(rng: np.random.Generator, origin: Vector, yaw: float, height_m: float) -> list[Patch]:
-    """A seat of this height: round on four legs, or a block."""
+    """Make a stool of this height: round on four legs, or a block."""
     frame = Frame(origin, rotation(1, yaw))
     if rng.random() < 0.4:
         return box(frame, (0.38, height_m, 0.38), _print(rng, 0.38, height_m))
     wood = _wood(rng, Canvas(0.4, 0.4, 300.0))
-    patches = [profiled(frame, "seat", wood, height_m)]
+    patches = [profile_solid(frame, "seat", wood, height_m)]
     for k in range(4):
         angle = np.pi / 4 + k * np.pi / 2
-        leg = frame.moved(*(0.13 * np.array([np.sin(angle), 0, np.cos(angle)])))
+        leg = frame.offset_by(*(0.13 * np.array([np.sin(angle), 0, np.cos(angle)])))
         patches.append(cylinder(leg, 0.018, height_m - 0.045, wood[:64, :64]))
     return patches
 
 
 def standing_prop(kind: str, rng: np.random.Generator, origin: Vector, yaw: float) -> list[Patch]:
-    """One of `STANDING` on the floor at `origin`."""
+    """Make one of `STANDING` on the floor at `origin`."""
     frame = Frame(origin, rotation(1, yaw))
     match kind:
         case "stool":
@@ -124,24 +124,26 @@ def standing_prop(kind: str, rng: np.random.Generator, origin: Vector, yaw: floa
         case "ball":
             return [ball(frame, float(rng.uniform(0.11, 0.3)), _print(rng, 0.8, 0.4))]
         case "suitcase":
-            rods = (frame.moved(x, 0.62, 0.0) for x in (-0.1, 0.1))
+            rods = (frame.offset_by(x, 0.62, 0.0) for x in (-0.1, 0.1))
             grip = [cylinder(rod, 0.009, 0.3, plain_chart(np.full(3, 0.3))) for rod in rods]
             return [*box(frame, (0.42, 0.62, 0.24), _print(rng, 0.42, 0.62)), *grip]
         case "table":
             return [
-                profiled(frame, "table", _wood(rng, Canvas(0.5, 0.5, 300.0)), float(rng.uniform(0.5, 0.75)))
+                profile_solid(
+                    frame, "table", _wood(rng, Canvas(0.5, 0.5, 300.0)), float(rng.uniform(0.5, 0.75))
+                )
             ]
         case "lamp":
             tall = float(rng.uniform(1.2, 1.6))
             metal = plain_chart(np.full(3, rng.uniform(0.1, 0.6)))
-            shade = profiled(frame, "shade", _print(rng, 0.8, 0.3), tall)
-            return [profiled(frame, "lamp", metal, tall), shade]
+            shade = profile_solid(frame, "shade", _print(rng, 0.8, 0.3), tall)
+            return [profile_solid(frame, "lamp", metal, tall), shade]
     return _plant(rng, frame)
 
 
 def _plant(rng: np.random.Generator, frame: Frame) -> list[Patch]:
-    """A pot with broad leaves."""
-    patches = [profiled(frame, "pot", _print(rng, 0.6, 0.27))]
+    """Make a pot with broad leaves."""
+    patches = [profile_solid(frame, "pot", _print(rng, 0.6, 0.27))]
     green = hsv(rng.uniform(0.22, 0.38), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.6))
     s, phi = np.meshgrid(np.linspace(0, 1, 14), np.linspace(-np.pi, np.pi, 11), indexing="ij")
     canvas = Canvas(0.1, 0.3, 300.0)
@@ -159,7 +161,7 @@ def _plant(rng: np.random.Generator, frame: Frame) -> list[Patch]:
 
 
 def held_prop(kind: str, rng: np.random.Generator, body: Body, side: str) -> list[Patch]:
-    """One of `HELD`, in the bind pose of this hand."""
+    """Make one of `HELD` in a hand in the bind pose."""
     H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
     along = -arm.frame[1]
@@ -175,17 +177,23 @@ def held_prop(kind: str, rng: np.random.Generator, body: Body, side: str) -> lis
         case "staff":
             return [
                 cylinder(
-                    frame.moved(0.0, -0.6, 0.0), 0.013, float(rng.uniform(1.0, 1.3)), _print(rng, 0.1, 0.9)
+                    frame.offset_by(0.0, -0.6, 0.0),
+                    0.013,
+                    float(rng.uniform(1.0, 1.3)),
+                    _print(rng, 0.1, 0.9),
                 )
             ]
         case "cup" | "bottle":
-            return [profiled(frame, kind, _print(rng, 0.2, 0.15), columns=17)]
+            return [profile_solid(frame, kind, _print(rng, 0.2, 0.15), columns=17)]
         case "ball":
             below = replace(frame, origin=grip + palm * 0.10 - forward * 0.115)
             return [ball(below, 0.115, _print(rng, 0.7, 0.35))]
         case "bag":
-            loop = cylinder(hanging.moved(0.0, -0.12, 0.0), 0.008, 0.13, plain_chart(0.5 * color))
-            return [*box(hanging.moved(0.0, -0.44, 0.0), (0.30, 0.32, 0.11), _print(rng, 0.30, 0.32)), loop]
+            loop = cylinder(hanging.offset_by(0.0, -0.12, 0.0), 0.008, 0.13, plain_chart(0.5 * color))
+            return [
+                *box(hanging.offset_by(0.0, -0.44, 0.0), (0.30, 0.32, 0.11), _print(rng, 0.30, 0.32)),
+                loop,
+            ]
     size = (0.15, 0.21, 0.025) if kind == "book" else (0.17, 0.24, 0.009)
     flat = replace(hanging, origin=grip + 0.14 * along + 0.02 * palm)
     return box(flat, size, _print(rng, size[0], size[1]))

@@ -1,4 +1,4 @@
-"""The performers' skeleton: joints, people's builds, and poses by two-bone inverse kinematics.
+"""The performers' skeleton: joints, body builds, and poses by two-bone inverse kinematics.
 
 The bind pose is an A-pose that faces +z, left side at +x, arms `ARM_ANGLE_RAD` away from hanging
 straight down.
@@ -24,7 +24,7 @@ Weights = Float[np.ndarray, "*n joint"]
 """Skinning weights, dense over the joints."""
 
 TABLES: dict[str, Any] = tomllib.loads((files("viewmend.studio.procedural") / "tables.toml").read_text())
-"""Name -> rows; the file's comments name the columns."""
+"""Tables by name; comments in the file name their columns."""
 
 ARM_ANGLE_RAD = np.radians(48.0)
 SKIRT_COLUMNS = 8
@@ -68,19 +68,21 @@ def rotation(axis: int, angle_rad: float) -> Rotation:
 
 
 def unit(v: Points) -> Points:
-    """`v` at length one."""
+    """Normalise vectors."""
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
 
 def hinge_frame(along: Vector, hinge: Vector) -> Rotation:
-    """Rotation whose -y axis is `along` (a bone) and whose x axis is as near `hinge` as that allows."""
+    """Compute the rotation with -y axis `along` (a bone) and an x axis as close to `hinge` as possible."""
     y = -unit(along)
     z = unit(np.cross(hinge, y))
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
 def two_bone(start: Vector, target: Vector, lengths: tuple[float, float], pole: Vector) -> tuple[Vector, ...]:
-    """Directions of a limb's two bones from `start` to `target`, its middle joint bent towards `pole`, and the hinge.
+    """Compute the directions of a limb's two bones from `start` to `target`, and the hinge.
+
+    The middle joint is bent towards `pole`.
 
     A target out of reach is replaced by the nearest point the limb does reach.
     """
@@ -108,14 +110,14 @@ class Skeleton:
         """Distance between two joints in the bind pose, metres."""
         return float(np.linalg.norm(self.at(second) - self.at(first)))
 
-    def moved(self, name: str, motion: Float[np.ndarray, "4 4"]) -> Vector:
-        """Where a motion from the bind pose takes this joint, world metres."""
+    def move_joint(self, name: str, motion: Float[np.ndarray, "4 4"]) -> Vector:
+        """Move a joint of the bind pose by a motion; world metres."""
         return motion[:3, :3] @ self.at(name) + motion[:3, 3]
 
     def place(self, name: str, R: Rotation, world_from_bind: Transforms) -> None:
-        """Set a joint to the world rotation R at the place its parent carries it to."""
+        """Set a joint to the world rotation R, at the position to which its parent carries it."""
         joint = INDEX[name]
-        origin = self.moved(name, world_from_bind[PARENTS[joint]])
+        origin = self.move_joint(name, world_from_bind[PARENTS[joint]])
         world_from_bind[joint, :3, :3] = R
         world_from_bind[joint, :3, 3] = origin - R @ self.at(name)
 
@@ -126,21 +128,21 @@ class Physique:
 
     height_m: float
     femininity: float
-    """0 masculine, 1 feminine: shoulders, hips, waist, bust, neck, jaw."""
+    """Femininity from 0 to 1: shoulders, hips, waist, bust, neck and jaw."""
     weight: float
-    """-1 thin, 0 average, 1.6 heavy."""
+    """Weight: -1 is thin, 0 average, 1.6 heavy."""
     muscle: float
-    """0 to 1."""
+    """Muscularity from 0 to 1."""
     leg_share: float
     """Length of the legs relative to the average."""
     skin_rgb: tuple[float, float, float]
     """sRGB."""
     face: tuple[float, ...]
-    """Eight numbers in [-1, 1]: the features' individual sizes and places."""
+    """Eight numbers in [-1, 1] for the individual sizes and positions of facial features."""
 
 
 def sample_physique(rng: np.random.Generator) -> Physique:
-    """Draw a person."""
+    """Sample a person's build."""
     feminine = bool(rng.random() < 0.5)
     height = rng.normal(1.66, 0.07) if feminine else rng.normal(1.78, 0.08)
     tone = rng.uniform(0, len(SKIN_RGB) - 1)
@@ -157,7 +159,7 @@ def sample_physique(rng: np.random.Generator) -> Physique:
 
 
 def build_skeleton(person: Physique) -> Skeleton:
-    """Bind positions of the joints of this person."""
+    """Compute the joints' bind positions of a person."""
     places: dict[str, Any] = dict(TABLES["trunk"])
     shoulder = 0.106 - 0.011 * person.femininity + 0.003 * person.muscle
     hip = 0.049 + 0.004 * person.femininity
@@ -181,13 +183,13 @@ def build_skeleton(person: Physique) -> Skeleton:
 
 
 def leg_stretch(y: Values, share: float) -> Values:
-    """Heights (fractions) after the legs take `share` of their length; ankles, shoulders and head stay."""
+    """Scale the legs' part of heights (fractions) by `share`; ankles, shoulders and head stay."""
     return np.interp(y, [0.0, 0.043, 0.522, 0.797, 1.0], [0.0, 0.043, 0.522 * share, 0.797, 1.0])
 
 
 @dataclass(frozen=True)
 class ArmPose:
-    """Angles of an arm against hanging straight down, radians; or a place for the wrist."""
+    """Angles of an arm relative to hanging straight down, radians; or a position of the wrist."""
 
     flexion: float = 0.0
     """Forward and up."""
@@ -199,17 +201,17 @@ class ArmPose:
     curl: float = 0.0
     """How far the fingers are curled."""
     target: Vector | None = None
-    """World place of the wrist, metres; the angles above then do not count."""
+    """World position of the wrist, metres, in place of the angles."""
 
 
 @dataclass(frozen=True)
 class FootPose:
-    """A foot: where the point below the ankle would be on a flat sole (world metres), where it points, its pitch."""
+    """A foot: world position of the point below the ankle on a flat sole (metres), direction and pitch."""
 
     place: Vector
     yaw: float
     pitch: float = 0.0
-    """Positive: the tip is up and the heel down; negative: the heel is up. The lower end keeps its place."""
+    """Pitch: positive lifts the tip, negative the heel. The lower end keeps its position."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,7 @@ class Stance:
     lean: float = 0.0
     roll: float = 0.0
     sway: float = 0.0
-    """Turn of the pelvis against the heading."""
+    """Rotation of the pelvis relative to the heading."""
     bend: float = 0.0
     side: float = 0.0
     twist: float = 0.0
@@ -233,7 +235,10 @@ class Stance:
     knees_out: float = 0.1
 
     def solve(self, skeleton: Skeleton, before: "Stance", elapsed_s: float) -> Transforms:
-        """world_from_bind of every joint; `before` is the stance `elapsed_s` earlier, for what swings behind."""
+        """Compute world_from_bind of every joint.
+
+        `before` is the stance `elapsed_s` earlier, which skirts and hair follow.
+        """
         world = np.tile(np.eye(4), (len(INDEX), 1, 1))
         R = rotation(1, self.yaw) @ rotation(1, self.sway) @ rotation(0, self.lean) @ rotation(2, -self.roll)
         world[0, :3, :3] = R
@@ -246,12 +251,12 @@ class Stance:
         for i, side in enumerate(SIDES):
             _place_arm(skeleton, side, self.arms[i], world)
             _place_leg(skeleton, side, self.feet[i], self, world)
-        _hang(skeleton, self, before, elapsed_s, world)
+        _place_hanging(skeleton, self, before, elapsed_s, world)
         return world
 
 
 def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Vector, Rotation]:
-    """World place of the ankle and rotation of the foot, which turns about its ball or its heel."""
+    """World position of the ankle and rotation of the foot, which turns about its ball or its heel."""
     ankle = skeleton.at(f"{side}_foot")
     toe = skeleton.at(f"{side}_toe")
     reach = float(toe[2] - ankle[2]) if foot.pitch < 0 else -0.45 * float(toe[2] - ankle[2])
@@ -262,7 +267,7 @@ def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Vector, Rotat
 
 
 def _reachable(skeleton: Skeleton, stance: Stance, R: Rotation) -> Vector:
-    """The pelvis, lowered where a leg would be too short for its foot."""
+    """Lower the pelvis until both legs reach their feet."""
     pelvis = stance.pelvis.copy()
     for i, side in enumerate(SIDES):
         ankle, _ = _ankle(skeleton, side, stance.feet[i])
@@ -279,7 +284,7 @@ def _reachable(skeleton: Skeleton, stance: Stance, R: Rotation) -> Vector:
 
 
 def _place_leg(skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, world: Transforms) -> None:
-    hip = skeleton.moved(f"{side}_thigh", world[0])
+    hip = skeleton.move_joint(f"{side}_thigh", world[0])
     ankle, foot_R = _ankle(skeleton, side, foot)
     names = [f"{side}_{part}" for part in ("thigh", "shin", "foot", "toe")]
     lengths = (skeleton.length(names[0], names[1]), skeleton.length(names[1], names[2]))
@@ -305,7 +310,7 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
         upper = R @ hanging
         fore = R @ rotation(0, -arm.elbow) @ hanging
     else:
-        shoulder = skeleton.moved(names[1], world[INDEX[names[0]]])
+        shoulder = skeleton.move_joint(names[1], world[INDEX[names[0]]])
         lengths = (skeleton.length(names[1], names[2]), skeleton.length(names[2], names[3]))
         pole = chest @ np.array([0.6 * s, -1.0, -0.7])
         along, second, hinge = two_bone(shoulder, arm.target, lengths, pole)
@@ -315,7 +320,9 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
         skeleton.place(name, R, world)
 
 
-def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, world: Transforms) -> None:
+def _place_hanging(
+    skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, world: Transforms
+) -> None:
     """Place the columns of a skirt, held off by the legs and pulled down by weight, and the tail of the hair."""
     pelvis = world[0, :3, :3]
     speed = pelvis.T @ (stance.pelvis - before.pelvis) / elapsed_s
@@ -324,7 +331,7 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     bones = {}
     for segment, first, last in (("high", "thigh", "shin"), ("low", "shin", "foot")):
         ends = [
-            [skeleton.moved(f"{s}_{part}", world[INDEX[f"{s}_{part}"]]) for part in (first, last)]
+            [skeleton.move_joint(f"{s}_{part}", world[INDEX[f"{s}_{part}"]]) for part in (first, last)]
             for s in SIDES
         ]
         bones[segment] = np.array([pelvis.T @ unit(end - start) for start, end in ends] + [weight])
@@ -338,7 +345,7 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
         spin = rotation(1, -give * 0.25 * float(np.tanh(turning / 4)))
         joints = np.array([INDEX[f"skirt{column}_{segment}"] for column in range(SKIRT_COLUMNS)])
         parents = np.array([PARENTS[joint] for joint in joints])
-        R = pelvis @ spin @ _tilted(outward, tilt)
+        R = pelvis @ spin @ _tilt(outward, tilt)
         bind = skeleton.positions[joints]
         origins = np.einsum("cij,cj->ci", world[parents, :3, :3], bind) + world[parents, :3, 3]
         world[joints, :3, :3] = R
@@ -349,7 +356,7 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     skeleton.place("tail", lag @ hinge_frame(drop, head @ np.array([1.0, 0, 0])), world)
 
 
-def _tilted(outward: Points, angle_rad: Values) -> Float[np.ndarray, "column 3 3"]:
+def _tilt(outward: Points, angle_rad: Values) -> Float[np.ndarray, "column 3 3"]:
     """Rotations that lift what hangs down (-y) towards `outward` by these angles."""
     x = outward[:, 0]
     z = outward[:, 2]
