@@ -39,6 +39,7 @@ COMMANDS = (
     Command("demo", "viewmend.cli.demo", "Render and inpaint a synthetic scene. Needs no data."),
     Command("view", "viewmend.cli.view", "Open a capture in the browser."),
     Command("serve", "viewmend.cli.serve", "Serve a capture or a live rig to browsers."),
+    Command("publish", "viewmend.cli.publish", "Write a capture as a web page of static files."),
     Command("mend", "viewmend.cli.mend", "Render and inpaint novel views of a capture."),
     Command("studio", "viewmend.cli.studio", "Generate synthetic captures with ground truth."),
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),

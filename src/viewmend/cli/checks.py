@@ -113,6 +113,21 @@ def load_named(name: str | None, device: str, precision: Precision = "auto") -> 
     return make_method(name, device, precision)
 
 
+def make_studio(
+    seed: int | None, cameras: int, frames: int, size_px: int, max_image_size: int | None
+) -> "PreparedCapture":
+    """The synthetic scene that stands for a capture; without a seed, one that no model was trained with."""
+    from viewmend.data.prepare import prepare
+    from viewmend.scenes.held_out import PROCEDURAL_SEEDS
+    from viewmend.studio.stage import Studio, StudioConfig
+
+    chosen = PROCEDURAL_SEEDS["test"][1] if seed is None else seed
+    config = StudioConfig(seed=chosen, cameras=cameras, frames=frames, size_px=size_px, fps=15.0)
+    return prepare(
+        Studio(config), max_image_size=max_image_size, align=False, match_colours=False, tighten_masks=False
+    )
+
+
 def chosen_times(text: str | None, count: int) -> range:
     """The frame indices that `--frames FIRST:END` selects out of `count`; all by default.
 

@@ -100,16 +100,11 @@ def run(options: Options) -> int:
 
 
 def _views(options: Options, first: "CachedFrame", rig: "Cameras", up: "Tensor | None") -> "Cameras":
+    from viewmend.completed_cameras import place_around
     from viewmend.data.camera_path import read_camera_path
-    from viewmend.geometry.orbit import orbit_around
     from viewmend.geometry.proxy import GeometryProxy
 
     if options.path is not None:
         return read_camera_path(options.path, rig)
     assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
-    center = first.proxy.mesh.vertices.mean(0).cpu()
-    count = options.views
-    around = orbit_around(center, rig, up, count, count)
-    # A rig on one side makes the path swing to and fro: then only its way there is used.
-    swings = count > 2 and around.centers[1].allclose(around.centers[-1], atol=1e-4)
-    return orbit_around(center, rig, up, count, 2 * count - 2) if swings else around
+    return place_around(rig, first.proxy.center, up, options.views)

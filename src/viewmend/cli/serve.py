@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
-from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
+from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least, make_studio
 from viewmend.utils.options import FLAT
 from viewmend.utils.plugins import import_object
 
 if TYPE_CHECKING:
-    from viewmend.data.source import CaptureSource
     from viewmend.live.frame_source import FrameSource
     from viewmend.live.server import ServerConfig
     from viewmend.models.base import Inpainter
@@ -235,7 +234,18 @@ def open_source(options: Options) -> "FrameSource":
         return rig_source(Path(options.source), options.fps, memory_mb, size_px, **prepared)
     if options.source == "studio":
         return RecordedSource(
-            partial(_make_studio, options), options.fps, generated=True, memory_mb=memory_mb
+            # made on the thread that reads its frames, so that the page is available at once
+            partial(
+                make_studio,
+                options.seed,
+                options.cameras,
+                options.frames,
+                options.size,
+                options.max_image_size,
+            ),
+            options.fps,
+            generated=True,
+            memory_mb=memory_mb,
         )
     from viewmend.cli.checks import log_preparation
     from viewmend.data.prepare import open_masked, prepare
@@ -244,25 +254,6 @@ def open_source(options: Options) -> "FrameSource":
     source = prepare(open_masked(options.source, format=options.format), max_image_size=size_px, **prepared)
     log_preparation(source)
     return RecordedSource(lambda: source, options.fps, memory_mb=memory_mb)
-
-
-def _make_studio(options: Options) -> "CaptureSource":
-    """The synthetic scene; made on the thread that reads its frames, so that the page is available at once."""
-    from viewmend.data.prepare import prepare
-    from viewmend.scenes.held_out import PROCEDURAL_SEEDS
-    from viewmend.studio.stage import Studio, StudioConfig
-
-    seed = PROCEDURAL_SEEDS["test"][1] if options.seed is None else options.seed
-    config = StudioConfig(
-        seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
-    )
-    return prepare(
-        Studio(config),
-        max_image_size=options.max_image_size,
-        align=False,
-        match_colours=False,
-        tighten_masks=False,
-    )
 
 
 def _serve_on_ray(options: Options, address: str) -> NoReturn:

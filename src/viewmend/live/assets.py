@@ -7,7 +7,8 @@ stored as differences and deflated: browsers inflate by themselves, so the page 
 and a mesh codec would save less than a tenth of a frame's bytes, most of which are images.
 
 The images: the part of each camera's image that shows the subject, as JPEG with colour at full
-resolution, followed by its mask, deflated. WebP halves the colour's resolution, and takes 15 times
+resolution, followed by its mask, deflated. Views that a model completed at other poses may be added
+as further cameras; their masks are alpha. WebP halves the colour's resolution, and takes 15 times
 as long, which rules out live rigs. On 20 cameras of wd2, with masks: JPEG 0.72 MB, 36.6 dB and 30
 ms; WebP of quality 90 0.49 MB, 35.4 dB and 385 ms.
 """
@@ -62,6 +63,11 @@ MEMORY_MB = 64.0
 """Memory for assets that are kept, in MB."""
 COMPRESSION = 6
 """zlib's compression level of meshes and masks."""
+COMPLETED_SOURCES = 4
+"""A page colours a view from this many cameras, where some of them are completed views."""
+COMPLETED_VIEW_POWER = 256
+"""The exponent of the cosine between the directions to camera and viewer, where some cameras are
+completed views: they stand closer to each other than real cameras."""
 Names = tuple[str, ...]
 Key = tuple[int, Names]
 """A frame, and the cameras that are left out."""
@@ -189,27 +195,35 @@ async def wait_for_frame(
     return frame
 
 
-def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig) -> FrameAssets:
-    """The assets of a frame with masks."""
-    cameras = []
-    images = []
-    lengths = []
-    for n, (rgb, mask) in enumerate(zip(frame.per_camera("rgb"), frame.per_camera("mask"), strict=True)):
-        top, bottom, left, right = _subject_box(mask.cpu().numpy())
-        part = rgb[:, top:bottom, left:right].movedim(0, -1).contiguous().cpu().numpy()
-        jpeg, packed_mask = _encode_image(part, mask[top:bottom, left:right].cpu().numpy())
-        cameras.append(frame.cameras[n].cropped(left, top, right - left, bottom - top))
-        images.append(Asset(jpeg + packed_mask, "image/jpeg"))
-        lengths.append(len(jpeg))
+def make_assets(
+    frame: MultiViewFrame,
+    proxy: GeometryProxy,
+    config: RenderConfig,
+    completed: MultiViewFrame | None = None,
+    jpeg_quality: int = JPEG_QUALITY,
+) -> FrameAssets:
+    """The assets of a frame with masks.
+
+    Args:
+        frame: the cameras' images.
+        proxy: the mesh to draw.
+        config: how many cameras colour a view, and how they are weighted.
+        completed: views of the same time that a model completed, with straight colours, and alpha as masks.
+        jpeg_quality: quality of the images, up to 100.
+    """
+    cameras, images = _image_assets(frame, jpeg_quality)
+    if completed is not None:
+        more_cameras, more_images = _image_assets(completed, jpeg_quality)
+        cameras += [camera | {"completed": True} for camera in more_cameras]
+        images += more_images
     arrays = _shape_arrays(frame, proxy)
     vertices = proxy.mesh.vertices
     blend = config.blend
     packed = {name: pack_differences(values) for name, (values, _) in arrays.items()}
-    described = cameras_json(concatenate_cameras(cameras))
     header: dict[str, Any] = {
         "time": frame.time,
         "center": (vertices.mean(0) if len(vertices) else proxy.bounds.center).tolist(),
-        "cameras": [camera | {"jpeg_bytes": size} for camera, size in zip(described, lengths, strict=True)],
+        "cameras": cameras,
         "blend": {
             "cameras": config.cameras,
             "normal_power": blend.normal_power,
@@ -218,6 +232,7 @@ def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfi
             "slope_px": blend.slope_px,
             "grazing": GRAZING,
             "min_weight": MIN_WEIGHT,
+            "completed": {"cameras": COMPLETED_SOURCES, "view_power": COMPLETED_VIEW_POWER},
         },
         "parts": [
             {"kind": name, "bytes": len(packed[name]), "rows": len(values), "columns": values.shape[1]} | more
@@ -226,6 +241,22 @@ def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfi
     }
     shape = Asset(pack(header, list(packed.values())), "application/octet-stream")
     return FrameAssets(shape, tuple(images))
+
+
+def _image_assets(frame: MultiViewFrame, jpeg_quality: int) -> tuple[list[dict[str, Any]], list[Asset]]:
+    """Each camera's image of the subject, and the camera of that part of the image in the protocol's form."""
+    cameras = []
+    images = []
+    lengths = []
+    for n, (rgb, mask) in enumerate(zip(frame.per_camera("rgb"), frame.per_camera("mask"), strict=True)):
+        top, bottom, left, right = _subject_box(mask.cpu().numpy())
+        part = rgb[:, top:bottom, left:right].movedim(0, -1).contiguous().cpu().numpy()
+        jpeg, packed_mask = _encode_image(part, mask[top:bottom, left:right].cpu().numpy(), jpeg_quality)
+        cameras.append(frame.cameras[n].cropped(left, top, right - left, bottom - top))
+        images.append(Asset(jpeg + packed_mask, "image/jpeg"))
+        lengths.append(len(jpeg))
+    described = cameras_json(concatenate_cameras(cameras))
+    return [camera | {"jpeg_bytes": size} for camera, size in zip(described, lengths, strict=True)], images
 
 
 def _shape_arrays(
@@ -286,12 +317,12 @@ def _subject_box(mask: UInt8[np.ndarray, "height width"]) -> tuple[int, int, int
 
 
 def _encode_image(
-    rgb: UInt8[np.ndarray, "height width 3"], mask: UInt8[np.ndarray, "height width"]
+    rgb: UInt8[np.ndarray, "height width 3"], mask: UInt8[np.ndarray, "height width"], jpeg_quality: int
 ) -> tuple[bytes, bytes]:
     """JPEG and deflated mask."""
     near = cv2.dilate(mask, np.ones((2 * KEPT_PX + 1, 2 * KEPT_PX + 1), np.uint8))
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     done, jpeg = cv2.imencode(".jpg", cv2.bitwise_and(bgr, bgr, mask=near), options)
     assert done, "8-bit images can be encoded"

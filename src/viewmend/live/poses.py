@@ -149,6 +149,22 @@ def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:
     ]
 
 
+def rig_json(
+    name: str, cameras: Cameras, bounds: Bounds, home: HomeView, fps: float | None, assets: str | None
+) -> dict[str, Any]:
+    """The message `rig`, without its type.
+
+    `assets` is the version of what pages draw, None if they draw nothing.
+    """
+    described = {
+        "name": name,
+        "cameras": cameras_json(cameras),
+        "bounds": bounds_json(bounds),
+        "assets": assets,
+    }
+    return described | home.as_json() | {"fps": fps}
+
+
 def bounds_json(bounds: Bounds) -> dict[str, list[float]]:
     """Bounds in the protocol's form."""
     return {"low": _list(bounds.low), "high": _list(bounds.high)}

@@ -20,7 +20,7 @@ from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.assets import FrameAssets, make_assets
 from viewmend.live.budget import ladder_for
 from viewmend.live.frame_source import FrameSource, RigInfo
-from viewmend.live.poses import HomeView, bounds_json, cameras_json, home_view, view_camera
+from viewmend.live.poses import HomeView, home_view, rig_json, view_camera
 from viewmend.live.protocol import BLACK, WHITE, Camera
 from viewmend.metrics.image_quality import psnr
 from viewmend.models.base import Inpainter, RenderQuality, State
@@ -173,14 +173,10 @@ class Renderer:
         home = home_view(cameras, center, rig.up)
         warm_up = view_camera(Camera(azimuth=home.azimuth), home, (WARM_UP_PX, WARM_UP_PX)).to(self._device)
         self._view(stream, warm_up, stream.viewer(), index, RenderQuality())
-        rig_json = {
-            "name": rig.name,
-            "cameras": cameras_json(cameras),
-            "bounds": bounds_json(bounds or proxy.bounds),
-        }
         self.assets_version = secrets.token_hex(4)
-        rig_json["assets"] = self.assets_version if self._draws_in_page else None
-        self.rig_json = rig_json | home.as_json() | {"fps": self._source.span.fps or None}
+        version = self.assets_version if self._draws_in_page else None
+        fps = self._source.span.fps or None
+        self.rig_json = rig_json(rig.name, cameras, bounds or proxy.bounds, home, fps, version)
         self._variants.clear()
         self._rig = rig
         self._stream = stream

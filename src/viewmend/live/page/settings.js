@@ -66,6 +66,8 @@ const SENSIBLE = {
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };
 
+/** Choices of a mode. */
+const CHOOSING = ["mode", "left", "right"];
 /** Storage key of the settings; those in the URL are not stored. */
 const KEPT = "viewmend.settings";
 const IN_ADDRESS = ["mode", "left", "right", "size", "without"];
@@ -80,15 +82,22 @@ function kept() {
 }
 
 export class Settings extends EventTarget {
-  /** @param {URLSearchParams} query choices by name, e.g. `?mode=split&size=320x320&reproject=0`; they go before kept ones */
-  constructor(query) {
+  /**
+   * @param {URLSearchParams} query choices by name, e.g. `?mode=split&size=320x320&reproject=0`; they go before kept ones
+   * @param {string[]} modes that can be shown
+   * @param {boolean} live whether a server renders views, too; if not, choices are not kept, and the controls begin hidden
+   */
+  constructor(query, modes, live) {
     super();
+    this.keeps = live;
     /** @type {any} */
     this.values = { ...DEFAULTS };
-    const before = kept();
+    if (!live) this.values.panel = false;
+    const before = live ? kept() : {};
     for (const [name, standard] of Object.entries(DEFAULTS)) {
       const given = query.get(name) ?? before[name] ?? null;
       if (typeof given !== "string" || SENSIBLE[name]?.(given) === false) continue;
+      if (CHOOSING.includes(name) && !modes.includes(given) && !(live && COMPARED.test(given))) continue;
       if (typeof standard === "boolean") this.values[name] = given !== "0";
       else if (typeof standard === "number" || name === "topK") this.values[name] = Number(given) || standard;
       else this.values[name] = given;
@@ -104,7 +113,7 @@ export class Settings extends EventTarget {
   set(name, value, own = true) {
     if (this.values[name] === value) return;
     this.values[name] = value;
-    if (own && !IN_ADDRESS.includes(name)) this.#keep(name, value);
+    if (own && this.keeps && !IN_ADDRESS.includes(name)) this.#keep(name, value);
     this.dispatchEvent(new CustomEvent("change", { detail: name }));
   }
 

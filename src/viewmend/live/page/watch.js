@@ -1,7 +1,7 @@
 // Watching what is on air: segment by segment, or where scripts cannot do that (iPhones) by the browser's own HLS player.
 // Where both can be had ours is chosen: Chromium's player (150) asked for the playlist 47 times a second.
 
-import { address } from "./link/connection.js";
+import { address } from "./link/address.js";
 import { SegmentPlayer } from "./link/segments.js";
 import { byId } from "./ui/dom.js";
 

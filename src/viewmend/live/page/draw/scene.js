@@ -3,7 +3,7 @@
 import { HoleFill } from "./fill.js";
 import { QUAD, buildProgram } from "./program.js";
 import { clipFromWorld } from "./projection.js";
-import { rankedCameras } from "../link/assets.js";
+import { sourcesOf } from "../link/assets.js";
 import { add, apply, multiply } from "../view/matrix.js";
 
 /** @typedef {import("../link/assets.js").Frame} Frame */
@@ -50,11 +50,15 @@ uniform vec3 eye;
 uniform float bias, slope, grazing, least;
 uniform vec2 powers;
 uniform bool leaves;   // holes to the next pass
+uniform bool cuts;   // the masks' mean is the view's alpha: those of completed views are closer to the outline than the mesh
+uniform vec3 ground;   // colour of the background
 uniform vec4 hole;    // colour of holes; that of the vertices where its alpha is 0, which then stays 0
 uniform mat4 pixels[${count}];   // (u z, v z, z) of a point
 uniform vec3 centers[${count}];
 uniform vec3 lenses[${count}];   // focal length, and depth = y (1 - z / metres)
 ${Array.from({ length: count }, (_, n) => `uniform sampler2D picture${n}, depth${n};`).join("\n")}
+
+float most = 0.0;   // sum of the weights that there would be if all were foreground
 
 vec4 weigh(sampler2D picture, sampler2D depth, mat4 pixel, vec3 center, vec3 lens, vec3 outward, vec3 toViewer) {
   vec3 toCamera = normalize(center - point);
@@ -75,17 +79,19 @@ vec4 weigh(sampler2D picture, sampler2D depth, mat4 pixel, vec3 center, vec3 len
   vec4 there = vec4(texelFetch(depth, a, 0).r, texelFetch(depth, b, 0).r, texelFetch(depth, c, 0).r, texelFetch(depth, d, 0).r);
   bvec4 visible = greaterThanEqual(there, vec4(nearest));
   vec4 seen;   // colour times mask, and mask
+  float usable = 1.0;
   if (all(visible)) {
     seen = textureLod(picture, uv / vec2(size), 0.0);
   } else {
     vec4 share = vec4((1.0 - part.x) * (1.0 - part.y), part.x * (1.0 - part.y), (1.0 - part.x) * part.y, part.x * part.y);
     share *= vec4(visible);
+    usable = dot(share, vec4(1.0));
     seen = share.x * texelFetch(picture, a, 0) + share.y * texelFetch(picture, b, 0)
       + share.z * texelFetch(picture, c, 0) + share.w * texelFetch(picture, d, 0);
   }
-  if (seen.a <= 0.0) return vec4(0.0);
-  float weight = seen.a * pow(facing, powers.x) * pow(agreeing, powers.y);
-  return vec4(seen.rgb / seen.a * weight, weight);
+  float direct = pow(facing, powers.x) * pow(agreeing, powers.y);
+  most += usable * direct;
+  return seen * direct;
 }
 
 void main() {
@@ -96,8 +102,11 @@ ${Array.from(
   { length: count },
   (_, n) => `  sum += weigh(picture${n}, depth${n}, pixels[${n}], centers[${n}], lenses[${n}], outward, toViewer);`,
 ).join("\n")}
-  if (leaves && sum.a < least) discard;
-  colour = sum.a >= least ? vec4(sum.rgb / sum.a, 1.0) : vec4(mix(tint, hole.rgb, hole.a), hole.a);
+  float known = cuts ? most : sum.a;
+  if (leaves && known < least) discard;
+  vec3 seen = sum.rgb / max(sum.a, 1e-6);
+  if (known < least) colour = vec4(mix(tint, hole.rgb, hole.a), hole.a);
+  else colour = vec4(cuts ? mix(ground, seen, min(1.0, sum.a / most)) : seen, 1.0);
 }`;
 
 /** Multiplied by the mask, so that bilinear samples weigh each pixel by it. */
@@ -148,38 +157,47 @@ export class Scene {
 
   /**
    * Make what a view needs; call it before anything is drawn, as it changes the framebuffer.
-   * @param {Frame} frame @param {number[]} eye @returns {any[]} the sources, the closest first
+   * @param {Frame} frame @param {number[]} eye @param {string[]} modes that will be drawn
    */
-  prepare(frame, eye) {
+  prepare(frame, eye, modes) {
     const own = this.kept.get(frame) ?? this.#upload(frame);
     this.kept.delete(frame);
     this.kept.set(frame, own);
     for (const old of this.kept.keys()) if (this.kept.size > KEPT) this.drop(old);
-    const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
-    const count = shape.header.blend.cameras + this.fillers;
-    const there = rankedCameras(shape, eye).filter((/** @type {number} */ n) => frame.images.has(n)).slice(0, count);
-    for (const n of there) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
-    return there.map((/** @type {number} */ n) => own.sources.get(n));
+    for (const mode of modes) {
+      const { first, fill } = this.#sources(frame, eye, mode);
+      for (const n of [...first, ...fill]) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
+    }
   }
 
-  /** The cut-outs of all images that are there, with their cameras; as `prepare`. @param {Frame} frame */
+  /** The numbers of the cameras that colour a view, of those whose images are there. @param {Frame} frame @param {number[]} eye @param {string} mode */
+  #sources(frame, eye, mode) {
+    const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
+    return sourcesOf(shape, eye, mode, this.fillers, (n) => frame.images.has(n));
+  }
+
+  /** The cut-outs of all cameras' images that are there; as `prepare`. @param {Frame} frame */
   cutOuts(frame) {
     const own = this.kept.get(frame);
     const { cameras } = /** @type {any} */ (frame.shape).header;
-    for (const n of frame.images.keys()) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
-    return [...own.sources].map(([n, source]) => ({ camera: cameras[n], picture: source.picture }));
+    const real = [...frame.images.keys()].filter((n) => !cameras[n].completed);
+    for (const n of real) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
+    return real.map((n) => ({ camera: cameras[n], picture: own.sources.get(n).picture }));
   }
 
-  /** Draw into a viewport, within the current scissor. @param {Frame} frame @param {any[]} sources @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
-  draw(frame, sources, viewer, eye, mode, viewport, ground) {
+  /** Draw into a viewport, within the current scissor. @param {Frame} frame @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
+  draw(frame, viewer, eye, mode, viewport, ground) {
     const { gl } = this;
     const own = this.kept.get(frame);
-    const { blend } = /** @type {any} */ (frame.shape).header;
+    const { blend, cameras } = /** @type {any} */ (frame.shape).header;
+    const { first, fill } = this.#sources(frame, eye, mode);
+    const cuts = first.some((n) => cameras[n].completed);
     const matrix = clipFromWorld(viewer);
     gl.bindVertexArray(own.array);
     gl.enable(gl.CULL_FACE); // the mesh is closed
-    const [first, hole] = [Math.min(MOST_SOURCES, blend.cameras), /** @type {any} */ (HOLES)[mode]];
-    const passes = [sources.slice(0, first), ...(hole[3] ? [] : [sources.slice(first)])].filter((pass) => pass.length);
+    const hole = /** @type {any} */ (HOLES)[mode];
+    const passes = [first, fill].map((numbers) => numbers.slice(0, MOST_SOURCES).map((n) => own.sources.get(n))).filter((pass) => pass.length);
+    const sources = passes.flat();
     if (passes.length > 1) {
       gl.useProgram(this.depthOnly.program);
       gl.uniformMatrix4fv(this.depthOnly.at.clip, false, matrix);
@@ -191,7 +209,10 @@ export class Scene {
       gl.stencilFunc(gl.NOTEQUAL, DONE, 0xff);
       gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
     }
-    passes.forEach((pass, n) => this.#pass(own, pass, { matrix, eye, blend, hole, leaves: n + 1 < passes.length }));
+    passes.forEach((pass, n) => {
+      const viewPower = cuts && n === 0 ? blend.completed.view_power : blend.view_power;
+      this.#pass(own, pass, { matrix, eye, blend, viewPower, hole, ground, cuts: cuts && n === 0, leaves: n + 1 < passes.length });
+    });
     gl.disable(gl.STENCIL_TEST);
     gl.disable(gl.CULL_FACE);
     gl.depthFunc(gl.LEQUAL);
@@ -203,8 +224,8 @@ export class Scene {
     this.cost = { draws: draws + Number(!hole[3]), triangles: (draws * own.count) / 3, textureBytes };
   }
 
-  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, hole: number[], leaves: boolean}} view */
-  #pass(own, sources, { matrix, eye, blend, hole, leaves }) {
+  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, viewPower: number, hole: number[], ground: number[], cuts: boolean, leaves: boolean}} view */
+  #pass(own, sources, { matrix, eye, blend, viewPower, hole, ground, cuts, leaves }) {
     const { gl } = this;
     const { program, at } = this.#blend(sources.length);
     gl.useProgram(program);
@@ -214,7 +235,9 @@ export class Scene {
     gl.uniform1f(at.slope, blend.slope_px);
     gl.uniform1f(at.grazing, blend.grazing);
     gl.uniform1f(at.least, blend.min_weight);
-    gl.uniform2f(at.powers, blend.normal_power, blend.view_power);
+    gl.uniform2f(at.powers, blend.normal_power, viewPower);
+    gl.uniform3fv(at.ground, ground);
+    gl.uniform1i(at.cuts, Number(cuts));
     gl.uniform1i(at.leaves, Number(leaves));
     gl.uniform4fv(at.hole, hole);
     sources.forEach((source, n) => {
@@ -240,7 +263,7 @@ export class Scene {
     const known = this.blends.get(count);
     if (known) return known;
     const each = (/** @type {(n: number) => string[]} */ names) => Array.from({ length: count }, (_, n) => names(n)).flat();
-    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "least", "powers", "leaves", "hole"];
+    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "least", "powers", "leaves", "cuts", "ground", "hole"];
     const perSource = each((n) => [`pixels[${n}]`, `centers[${n}]`, `lenses[${n}]`, `picture${n}`, `depth${n}`]);
     const made = buildProgram(this.gl, VERTEX, blending(count), [...uniforms, ...perSource]);
     this.blends.set(count, made);

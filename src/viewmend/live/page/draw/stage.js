@@ -179,7 +179,7 @@ export class Stage {
   #scene(viewer, [x, y, width, height], wish, frame, eye) {
     const { gl, header } = this;
     const place = eyeOfCamera(viewer);
-    const sources = this.scene.prepare(frame, place);
+    this.scene.prepare(frame, place, wish.parts.map(({ mode }) => this.shownMode(viewer, mode)));
     const cutOuts = wish.rig ? this.scene.cutOuts(frame) : [];
     const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
     const source = header?.cameras[Math.min(eye, header.cameras.length - 1)];
@@ -203,7 +203,7 @@ export class Stage {
         this.#photo(viewer, mode);
         continue;
       }
-      if (over < 1 || wish.rig) this.scene.draw(frame, sources, viewer, place, mode, [x, y, width, height], this.ground);
+      if (over < 1 || wish.rig) this.scene.draw(frame, viewer, place, mode, [x, y, width, height], this.ground);
       if (over > 0) this.#overlay(kept, kept.textures[mode], over);
     }
     gl.scissor(x, y, width, height);

@@ -14,8 +14,13 @@ const RETRY_MS = 100;
  * @property {Uint32Array} faces
  */
 /** @typedef {{picture: ImageBitmap, mask: Uint8Array}} CameraImage */
-/** @typedef {{key: string, url: string, camera?: any}} Order `camera`: its entry in the shape, for an image */
+/** @typedef {{key: string, url: string, camera?: any, keeps?: boolean}} Order `camera`: its entry in the shape, for an image; `keeps`: files are kept as they came */
 /** @typedef {{key: string, shape?: Shape, image?: CameraImage, bytes?: number, failed?: string}} News */
+
+/** Files that were fetched, by address, and their bytes in all: a performance that is played again needs no network. @type {Map<string, ArrayBuffer>} */
+const kept = new Map();
+const MOST_KEPT_BYTES = 2 ** 27;
+let keptBytes = 0;
 
 /** @param {Uint8Array} bytes @returns {Promise<Uint8Array>} */
 async function inflate(bytes) {
@@ -89,9 +94,12 @@ async function fetchPatiently(url) {
 }
 
 /** @param {Order} order @returns {Promise<{news: News, transfer: Transferable[]}>} */
-async function carryOut({ key, url, camera }) {
-  const answer = await fetchPatiently(url);
-  const content = await answer.arrayBuffer();
+async function carryOut({ key, url, camera, keeps }) {
+  const content = kept.get(url) ?? (await (await fetchPatiently(url)).arrayBuffer());
+  if (keeps && !kept.has(url) && keptBytes + content.byteLength <= MOST_KEPT_BYTES) {
+    kept.set(url, content);
+    keptBytes += content.byteLength;
+  }
   const bytes = content.byteLength;
   if (camera) {
     const image = await readImage(content, camera);

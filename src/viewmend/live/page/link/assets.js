@@ -1,6 +1,5 @@
 // Which frames the page can draw by itself: asks for their assets ahead of time, and keeps those used last.
 
-import { address } from "./connection.js";
 import { dot, sub, unit } from "../view/matrix.js";
 
 /** @typedef {import("./asset_worker.js").Shape} Shape */
@@ -22,7 +21,10 @@ const [AHEAD, MOST_MS] = [3, 2000];
 /** Failed frames in a row after which the server draws. */
 const MOST_FAILURES = 3;
 
-/** The cameras' numbers by their angle to the eye, seen from the subject's centre. @param {Shape} shape @param {number[]} eye */
+/** Frames beyond the next that are asked for where the clock waits for late frames, and those that end the wait. */
+const [AHEAD_PATIENT, RESUMING] = [8, 4];
+
+/** All cameras' numbers by their angle to the eye, seen from the subject's centre. @param {Shape} shape @param {number[]} eye @returns {number[]} */
 export function rankedCameras({ header: { cameras, center } }, eye) {
   const toEye = unit(sub(eye, center));
   const near = cameras.map((/** @type {any} */ camera) => dot(unit(sub(camera.center, center)), toEye));
@@ -30,16 +32,44 @@ export function rankedCameras({ header: { cameras, center } }, eye) {
     .sort((/** @type {number} */ a, /** @type {number} */ b) => near[b] - near[a] || a - b);
 }
 
+/**
+ * The cameras that colour a view: `first` the ones that the blending rule names, `fill` those that fill its holes. Completed
+ * views are used like cameras that see more, except where the view is shown as rendered.
+ * @param {Shape} shape @param {number[]} eye @param {string} mode @param {number} fillers cameras that fill holes
+ * @param {(n: number) => boolean} [usable] whether a camera's image may be used
+ * @returns {{first: number[], fill: number[]}} cameras' numbers, the closest first
+ */
+export function sourcesOf(shape, eye, mode, fillers, usable = () => true) {
+  const { cameras, blend } = shape.header;
+  const ranked = rankedCameras(shape, eye).filter(usable);
+  const real = ranked.filter((n) => !cameras[n].completed);
+  if (mode === "rendered" || mode === "holes") return { first: real.slice(0, blend.cameras), fill: [] };
+  if (!cameras.some((/** @type {any} */ camera) => camera.completed)) {
+    return { first: real.slice(0, blend.cameras), fill: real.slice(blend.cameras, blend.cameras + fillers) };
+  }
+  const first = ranked.slice(0, blend.completed.cameras);
+  return { first, fill: real.filter((n) => !first.includes(n)).slice(0, blend.cameras) };
+}
+
 /** Whether as many images are there as the blending rule needs. @param {Frame} frame */
 const complete = ({ shape, images }) => shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
 
 /** Dispatches "change" (detail: the frame) when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
 export class Assets extends EventTarget {
-  /** @param {string | null} token @param {number} fillers cameras of a playing frame beyond the blending rule's */
-  constructor(token, fillers) {
+  /**
+   * @param {(path: string, version: string, without: string) => string} locate the address of a shape ("TIME") or an image ("TIME/CAMERA")
+   * @param {boolean} [patient] whether the clock waits for late frames, and files that were fetched are kept
+   */
+  constructor(locate, patient = false) {
     super();
-    this.token = token;
-    this.fillers = fillers;
+    this.locate = locate;
+    this.patient = patient;
+    /** Cameras of a playing frame beyond the blending rule's. */
+    this.fillers = 0;
+    /** What is shown. */
+    this.modes = ["completed"];
+    /** Whether the clock waits. */
+    this.buffering = false;
     /** The version that the server's message `rig` names; null if the server draws. @type {string | null} */
     this.version = null;
     /** Names of cameras that are not used, separated by commas. */
@@ -84,6 +114,14 @@ export class Assets extends EventTarget {
     this.#clear();
   }
 
+  /** Let go of everything. */
+  close() {
+    this.#clear();
+    this.worker?.terminate();
+    this.worker = null;
+    this.version = null;
+  }
+
   #clear() {
     this.shown = null;
     for (const frame of this.frames.values()) this.#forget(frame);
@@ -106,10 +144,23 @@ export class Assets extends EventTarget {
   }
 
   /** Whether all that the blending rule needs is there. @param {Frame} frame @param {number[]} eye */
-  drawable({ shape, images }, eye) {
-    if (!shape) return false;
-    const { header } = shape;
-    return rankedCameras(shape, eye).slice(0, header.blend.cameras).every((/** @type {number} */ n) => images.has(n));
+  drawable(frame, eye) {
+    return frame.shape !== null && this.needed(frame, eye).every((n) => frame.images.has(n));
+  }
+
+  /** The cameras' numbers that colour what is shown. @param {Frame} frame whose shape is there @param {number[]} eye @returns {number[]} */
+  needed({ shape }, eye) {
+    const used = this.modes.map((mode) => sourcesOf(/** @type {Shape} */ (shape), eye, mode, this.fillers).first);
+    return [...new Set(used.flat())];
+  }
+
+  /** Whether playback has to wait at a frame: once it does, until some of the next ones are there, too. @param {number} time @param {number[]} eye @param {{first: number, end: number}} range */
+  buffers(time, eye, { first, end }) {
+    const count = Math.max(1, end - first);
+    const ahead = this.buffering ? Math.min(count, RESUMING) : 1;
+    const frames = Array.from({ length: ahead }, (_, step) => this.frames.get(first + ((time - first + step) % count)));
+    this.buffering = !frames.every((frame) => frame && this.drawable(frame, eye));
+    return this.buffering;
   }
 
   /**
@@ -119,8 +170,8 @@ export class Assets extends EventTarget {
    */
   want(time, eye, { first, end }, { playing, framesPerMs, live }) {
     const count = Math.max(1, end - first);
-    const late = playing ? Math.ceil(framesPerMs * this.#expected()) : 0;
-    const ahead = playing && !live ? Math.min(count - 1, AHEAD + late) : 0;
+    const late = playing && !this.patient ? Math.ceil(framesPerMs * this.#expected()) : 0;
+    const ahead = playing && !live ? Math.min(count - 1, (this.patient ? AHEAD_PATIENT : AHEAD) + late) : 0;
     const steps = (/** @type {Frame} */ frame) => (((frame.time - time) % count) + count) % count;
     let loading = 0;
     for (const frame of this.frames.values()) {
@@ -151,9 +202,9 @@ export class Assets extends EventTarget {
       this.#ask(`${time}`, null);
       return false;
     }
-    const ranked = rankedCameras(shape, eye);
-    const wanted = playing ? ranked.slice(0, shape.header.blend.cameras + this.fillers) : ranked;
-    const missing = wanted.filter((/** @type {number} */ n) => !images.has(n));
+    const played = this.modes.map((mode) => sourcesOf(shape, eye, mode, this.fillers));
+    const wanted = playing ? played.flatMap(({ first, fill }) => [...first, ...fill]) : [...this.needed(frame, eye), ...rankedCameras(shape, eye)];
+    const missing = [...new Set(wanted)].filter((n) => !images.has(n));
     for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
     return missing.length === 0;
   }
@@ -163,10 +214,8 @@ export class Assets extends EventTarget {
     const key = `${this.round} ${path}`;
     if (this.waiting.has(key) || this.waiting.size >= REQUESTS) return;
     this.waiting.add(key);
-    const url = address(`assets/${path}`, this.token);
-    url.searchParams.set("v", this.version ?? "");
-    if (this.without) url.searchParams.set("without", this.without);
-    this.worker?.postMessage({ key, url: url.href, camera });
+    const url = this.locate(path, this.version ?? "", this.without);
+    this.worker?.postMessage({ key, url, camera, keeps: this.patient });
   }
 
   /** @param {number} time @returns {Frame} */

@@ -1,5 +1,7 @@
 // The link to the server: hello, messages as events, and a new try when it breaks.
 
+import { address } from "./address.js";
+
 const VERSION = 1;
 const LONGEST_WAIT_MS = 15000;
 /** Close codes after which another try is pointless. */
@@ -8,16 +10,6 @@ const FINAL = {
   4426: "The page and the server have different versions. Reload the page.",
 };
 const REASONS = { 4429: "This page sent too many messages; the server closed the connection.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
-
-/**
- * The address of a path of the server, which a proxy may serve under a prefix: relative to this file's own address.
- * @param {string} path @param {string | null} token
- */
-export function address(path, token) {
-  const url = new URL(`../../${path}`, import.meta.url);
-  url.search = token === null ? "" : new URLSearchParams({ token }).toString();
-  return url;
-}
 
 /**
  * Events: "message" (detail: a JSON message), "picture" (detail: a frame, decoded), "trouble" (detail: text, of one that cannot

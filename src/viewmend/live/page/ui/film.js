@@ -1,6 +1,6 @@
 // A film that the server renders: how far it is, how long it will still take, and a way to call it off.
 
-import { address } from "../link/connection.js";
+import { address } from "../link/address.js";
 
 const ASK_MS = 500;
 

@@ -39,10 +39,11 @@ export function offerModels(settings, own, models) {
   }
 }
 
-/** @param {Settings} settings */
-export function buildModes(settings) {
+/** @param {Settings} settings @param {string[]} modes that can be shown */
+export function buildModes(settings, modes) {
   const strip = byId("modes");
-  for (const [value, text] of Object.entries(MODES)) {
+  const offered = Object.entries(MODES).filter(([value]) => modes.includes(value));
+  for (const [value, text] of offered) {
     const button = element("button", { type: "button", textContent: text });
     button.setAttribute("role", "radio");
     button.dataset.value = value;
@@ -53,7 +54,7 @@ export function buildModes(settings) {
 
   for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
     const list = byId(`split-${side}`);
-    for (const [value, text] of Object.entries(MODES)) {
+    for (const [value, text] of offered) {
       if (value !== "split") list.append(element("option", { value, textContent: text }));
     }
     list.addEventListener("change", () => settings.set(side, list.value));

@@ -1,6 +1,6 @@
 // On air: what this page shows is the film that all who open /watch see.
 
-import { address } from "../link/connection.js";
+import { address } from "../link/address.js";
 import { byId } from "./dom.js";
 
 export class OnAir {

@@ -1,6 +1,6 @@
 // The image of the camera that the view is at, next to the view, and how far the view is from it if the camera is left out.
 
-import { address } from "../link/connection.js";
+import { address } from "../link/address.js";
 import { byId } from "./dom.js";
 import { Scores } from "./scores.js";
 

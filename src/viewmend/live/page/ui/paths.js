@@ -1,16 +1,28 @@
-// The section "Camera path": record, add views, play, and export as MP4 by the server.
+// The section "Camera path": record, add views, play, and export as MP4.
 
-import { address } from "../link/connection.js";
 import { fovOf, lensOf } from "../view/lens.js";
 import { FPS, MOST_POSES, Track } from "../view/camera_path.js";
 import { extrinsicsOf } from "../view/pose.js";
 import { pathFile, pointsOf } from "../view/camera_path_file.js";
 import { byId, download, element } from "./dom.js";
 import { clamp } from "../view/matrix.js";
-import { Film } from "./film.js";
 
 /** How far a film's two eyes are apart, metres; players know by the name's end, _SBS, that they lie side by side. */
 const EYES_M = 0.064;
+
+/**
+ * @typedef {object} FilmInMaking
+ * @property {number} since when it was begun, ms
+ * @property {(request: any) => Promise<Blob | null>} make null where it was called off
+ * @property {() => void} cancel
+ */
+
+/**
+ * @typedef {object} Films what renders films
+ * @property {(onProgress: (progress: {part: number, text: string}) => void) => FilmInMaking} make
+ * @property {(asked: Record<string, number>) => Promise<{target: number[], distance: number, f: number}>} turntable the distance and
+ *   the focal length in pixels at which every image shows the whole motion
+ */
 
 /**
  * @typedef {object} Surroundings
@@ -18,7 +30,7 @@ const EYES_M = 0.064;
  * @property {import("./transport.js").Transport} transport
  * @property {import("./notices.js").Notices} notices
  * @property {import("../settings.js").Settings} settings
- * @property {string | null} token
+ * @property {Films} films
  * @property {() => void} wake
  */
 
@@ -30,7 +42,7 @@ export class PathPanel {
     this.recording = false;
     /** @type {{since: number, hands: number} | null} */
     this.playing = null;
-    /** The film that is being rendered. @type {Film | null} */
+    /** The film that is being rendered. @type {FilmInMaking | null} */
     this.film = null;
     this.progressText = "";
     this.listed = "";
@@ -70,7 +82,7 @@ export class PathPanel {
 
   /** Around the subject at the height that is looked from, so that the film shows the whole motion. */
   async #turntable() {
-    const { motion, transport, notices, token } = this.around;
+    const { motion, transport, notices, films } = this.around;
     if (!motion.goal) return;
     this.recording = false;
     this.playing = null;
@@ -80,13 +92,9 @@ export class PathPanel {
     const time = Math.max(0, transport.shown);
     const frames = this.#still ? 1 : Math.ceil(seconds * (motion.rig.fps ?? 0)) + 1;
     const { width, height } = this.#size();
-    const url = address("turntable", token);
-    for (const [name, value] of Object.entries({ time, frames, azimuth, arc, elevation, width, height })) url.searchParams.set(name, String(value));
     button.disabled = true;
     try {
-      const answer = await fetch(url);
-      const { error, target, distance, f } = await answer.json();
-      if (!answer.ok) throw new Error(error);
+      const { target, distance, f } = await films.turntable({ time, frames, azimuth, arc, elevation, width, height });
       const fov = fovOf({ width, height }, f);
       this.track.turntable({ target, azimuth, elevation, roll: 0, distance, fov }, arc, seconds, time);
     } catch (error) {
@@ -215,8 +223,8 @@ export class PathPanel {
   }
 
   async #export() {
-    const { notices, token } = this.around;
-    const film = new Film(token, ({ part, text }) => {
+    const { notices, films } = this.around;
+    const film = films.make(({ part, text }) => {
       byId("path-progress").value = part;
       this.progressText = text;
       this.#show();

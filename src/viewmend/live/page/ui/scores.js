@@ -1,6 +1,6 @@
 // How close the view is to the image of a camera that is left out: error map and PSNR of the subject, from the server.
 
-import { address } from "../link/connection.js";
+import { address } from "../link/address.js";
 
 /** The view has been at the camera for so long before it is scored. */
 const WAIT_MS = 300;

@@ -26,7 +26,9 @@ export const timeOf = (text) => (/^\d{1,9}$/.test(text ?? "") ? Number(text) : -
 
 /** Writes the view to the URL once it rests. */
 export class Place {
-  constructor() {
+  /** @param {"search" | "hash"} part of the URL that holds it */
+  constructor(part) {
+    this.part = part;
     this.timer = 0;
     /** @type {Record<string, string | null>} */
     this.query = {};
@@ -47,12 +49,15 @@ export class Place {
   #write() {
     clearTimeout(this.timer);
     this.timer = 0;
-    const url = new URL(location.href);
+    const values = new URLSearchParams(location[this.part].slice(1));
     for (const [name, value] of Object.entries(this.query)) {
-      if (value === null) url.searchParams.delete(name);
-      else url.searchParams.set(name, value);
+      if (value === null) values.delete(name);
+      else values.set(name, value);
     }
-    const search = url.search.replaceAll("%2C", ",");
-    if (search !== location.search) history.replaceState(null, "", search || location.pathname);
+    const text = values.toString().replaceAll("%2C", ",");
+    if (text === location[this.part].slice(1)) return;
+    const url = new URL(location.href);
+    url[this.part] = text;
+    history.replaceState(null, "", url);
   }
 }

@@ -1,0 +1,182 @@
+"""A published folder in Chromium, served by `python -m http.server` below a path, and in an iframe."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from live.browser.conftest import SCREENSHOT_S, SIZES, View
+from published_ball import FRAMES, published  # noqa: F401
+
+FRAME = """<link rel="icon" href="data:,"><body style="margin:0">
+<iframe src="some/ball/index.html" style="width:900px;height:600px;border:0"></iframe>"""
+DRAWN = """Array.from([window, window[0] ?? window]).some(
+  page => page.document.querySelector("#picture")?.dataset.drawn !== undefined)"""
+
+
+@pytest.fixture(scope="module")
+def host(published):  # noqa: F811
+    """The address of the folder two above the performance, which has a page with an iframe, too."""
+    root = published.parents[1]
+    (root / "frame.html").write_text(FRAME)
+    command = [
+        sys.executable,
+        "-u",
+        "-m",
+        "http.server",
+        "--bind",
+        "127.0.0.1",
+        "--directory",
+        str(root),
+        "0",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        line = server.stdout.readline()
+        yield re.search(r"http://[\d.]+:\d+/", line)[0]
+        server.terminate()
+
+
+class Performance(View):
+    """The published page; all its requests and errors are recorded."""
+
+    def __init__(self, browser, url, size="desktop") -> None:
+        width, height = SIZES[size]
+        touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
+        self.context = browser.new_context(viewport={"width": width, "height": height}, **touch)
+        super().__init__(self.context.new_page(), None, [])
+        self.asked: list[str] = []
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
+        self.page.goto(url)
+
+    def __enter__(self):
+        self.until(DRAWN, SCREENSHOT_S)
+        return self
+
+    def __exit__(self, *_):
+        self.context.close()
+        assert not self.errors, self.errors
+
+    def paused(self, time: int) -> np.ndarray:
+        """The canvas with this frame, at rest."""
+        self.until(lambda: self.data("drawn") == str(time), SCREENSHOT_S)
+        self.page.wait_for_timeout(500)
+        return self.picture()
+
+
+def middle_of(picture: np.ndarray) -> np.ndarray:
+    """The pixels around the subject."""
+    height, width, _ = picture.shape
+    return picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+
+
+def test_the_first_picture_appears_and_orbiting_changes_it(browser, host):
+    with Performance(browser, f"{host}some/ball/#time=0") as page:
+        shown = page.paused(0)
+        assert (middle_of(shown).max(-1) > 60).mean() > 0.05, "the ball"
+        assert page.page.locator("#poster").count() == 0 and page.page.locator("#cover").is_hidden()
+        assert page.page.title() == "A <ball>"
+        page.drag(160, 0)
+        page.page.wait_for_timeout(500)
+        assert np.abs(page.picture() - shown).mean() > 1
+        page.until(lambda: "pose=" in page.page.url)
+        assert all(url.startswith((f"{host}some/ball/", "blob:", "data:")) for url in page.asked), (
+            "nothing else is asked for"
+        )
+        assert page.page.locator("#modes button").all_inner_texts() == [
+            "Rendered",
+            "Holes",
+            "Completed",
+            "Side by side",
+        ]
+
+
+def test_a_link_restores_pose_frame_and_mode(browser, host):
+    with Performance(browser, f"{host}some/ball/#time=2&mode=rendered") as page:
+        page.paused(2)
+        page.drag(90, 40)
+        page.until(lambda: "pose=" in page.page.url and "time=2" in page.page.url)
+        page.page.wait_for_timeout(500)
+        shown, link = page.picture(), page.page.url
+    with Performance(browser, link) as page:
+        assert np.abs(page.paused(2) - shown).mean() < 0.2
+        assert page.page.locator("#modes [aria-checked=true]").inner_text() == "Rendered"
+        page.page.evaluate("location.hash = 'time=1'")
+        page.paused(1)
+
+
+def test_the_time_line_plays_and_seeks(browser, host):
+    with Performance(browser, f"{host}some/ball/") as page:
+        seen = set()
+
+        def all_played() -> bool:
+            seen.add(page.data("drawn"))
+            return seen >= {str(time) for time in range(FRAMES)}
+
+        page.until(all_played, SCREENSHOT_S)
+        page.page.locator("#seek").fill("3")
+        page.page.keyboard.press("Space")
+        page.page.locator("#seek").fill("1")
+        page.paused(1)
+        assert page.page.locator("#time").inner_text() == f"2 / {FRAMES}"
+
+
+def test_completed_views_are_used_for_completed_and_not_for_rendered(browser, host):
+    for mode, uses in (("completed", True), ("rendered", False)):
+        with Performance(browser, f"{host}some/ball/#time=0&mode={mode}") as page:
+            page.paused(0)
+            first = [url for url in page.asked if "/frames/0/" in url and "shape" not in url][:3]
+            completed = [int(re.search(r"/(\d+)\.bin", url)[1]) >= 6 for url in first]
+            assert any(completed) == uses
+
+
+def test_it_works_in_an_iframe(browser, host):
+    with Performance(browser, f"{host}frame.html") as page:
+        inside = page.page.frames[1]
+        inside.wait_for_function("document.querySelector('#picture').dataset.drawn !== undefined")
+        page.page.wait_for_timeout(500)
+        shown = page.pixels()[:600, :900]
+        assert (middle_of(shown).max(-1) > 60).mean() > 0.05
+
+
+def test_a_path_becomes_a_film_without_a_server(browser, host, tmp_path):
+    with Performance(browser, f"{host}some/ball/#time=0") as page:
+        page.paused(0)
+        page.page.keyboard.press("h")
+        page.page.locator("#path-seconds").fill("1")
+        page.page.locator("#path-time").select_option("still")
+        page.page.locator("#path-turntable").click()
+        page.until(lambda: page.page.locator("#path-export").is_enabled())
+        with page.page.expect_download(timeout=1000 * SCREENSHOT_S) as waiting:
+            page.page.locator("#path-export").click()
+        film = tmp_path / "film.mp4"
+        waiting.value.save_as(film)
+    import av
+
+    with av.open(str(film)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert float(container.streams.video[0].average_rate) == 30
+    assert len(frames) == 31 and frames[0].shape == (480, 480, 3)
+    assert all((middle_of(frame).max(-1) > 60).mean() > 0.05 for frame in frames)
+    assert np.abs(frames[0].astype(int) - frames[15]).mean() > 1, "the other side"
+    assert np.abs(frames[0].astype(int) - frames[30]).mean() < 2, "a whole turn"
+
+
+def test_missing_files_are_reported(browser, host):
+    with Performance(browser, f"{host}some/ball/#time=0") as page:
+        page.paused(0)
+        page.page.route("**/frames/**", lambda route: route.abort())
+        page.page.locator("#seek").fill("2")
+        page.until(lambda: "missing" in page.page.locator("#cover-text").inner_text(), SCREENSHOT_S)
+        page.errors.clear()
+
+
+@pytest.mark.parametrize("size", ["phone"])
+def test_the_page_fits_a_phone(browser, host, size):
+    with Performance(browser, f"{host}some/ball/#time=0", size) as page:
+        page.paused(0)
+        page.tab("path")
+        assert page.page.locator("#path-turntable").is_visible()
+        assert page.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
