@@ -19,7 +19,7 @@ from viewmend.studio.retarget import (
 )
 
 
-def skin(body: Retarget, frame: int) -> torch.Tensor:
+def pose_at(body: Retarget, frame: int) -> torch.Tensor:
     """World matrices of the nodes in a frame."""
     hips = body.hips, body.hips_path[frame]
     return node_matrices(body.character, body.upright_from_file, body.driver, body.rotations[frame], hips)
@@ -30,7 +30,7 @@ FAMILIES = ("acclaim", "cgspeed", "humanik", "mixamo", "rigify", "mannequin")
 
 def test_limbs_point_as_the_actors_do(character_file, motion_file):
     character, motion = load_character(character_file), read_bvh(motion_file)
-    world = posed(retarget(character, motion), 3)
+    world = pose_at(retarget(character, motion), 3)
     at = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
     offsets = {name: torch.tensor(o, dtype=torch.float32) for name, (_, o) in BVH_JOINTS.items()}
     for (start, end), (joint, child) in {
@@ -62,7 +62,7 @@ def test_hips_are_where_the_actors_are_in_the_size_of_the_character(character_fi
     actor_cm, middle_cm = legs(dict(zip(motion.names, motion.rest, strict=True)), "Hip", "Knee", "Ankle")
     own_m, _ = legs({name: place for name, (_, place) in JOINTS.items()}, "UpLeg", "Leg", "Foot")
     for frame in (0, 1, 3):
-        world = posed(body, frame)
+        world = pose_at(body, frame)
         at = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
         expected_cm = motion.root[frame] + motion.rotations[frame, 0] @ middle_cm
         found = (at["LeftUpLeg"] + at["RightUpLeg"]) / 2
