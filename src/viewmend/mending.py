@@ -122,7 +122,7 @@ class Mender(ViewSequence):
         holes = replace(view, error=view.holes.to(view.rgb))
         telea, _ = Telea().step_on(self.background, holes, ContextProvider(lambda *_: None), State())
         scores = FillScores(
-            score_view(CompletedView(view, view.cut_rgb), true, psnr_only),
+            score_view(CompletedView(view, view.cut_rgb), true, replace(self._scorers, ssim=None)),
             score_view(telea, true, psnr_only),
             score_view(made.completed, true, self._scorers),
         )
@@ -181,6 +181,7 @@ class MendSummary:
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
             "ssim_whole": self.mean("ours", "ssim_whole"),
             "lpips_whole": self.mean("ours", "lpips_alex_whole"),
+            "lpips_whole_rendered": self.mean("unfilled", "lpips_alex_whole"),
             "lpips_subject": self.mean("ours", "lpips_alex_subject"),
             **{name: self.mean("ours", name) for name in ("psnr_subject", "alpha_iou", "psnr_valid")},
             "psnr_holes": self.mean("ours", "psnr_holes"),

@@ -27,7 +27,7 @@ from viewmend.utils.contact_sheet import picture
 
 KEYS = [
     "frames", "protocol", "background", "hole_fraction", "completed_fraction", "psnr_whole", "psnr_whole_rendered",
-    "ssim_whole", "lpips_whole", "lpips_subject", "psnr_subject", "alpha_iou",
+    "ssim_whole", "lpips_whole", "lpips_whole_rendered", "lpips_subject", "psnr_subject", "alpha_iou",
     "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou",
     "stage_ms",
 ]  # fmt: skip

@@ -21,6 +21,7 @@ from viewmend.models.checkpoint import load_config, save_inpainter
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.training.held_back import HeldBackValidation
 from viewmend.training.recipes import RECIPES
 
 BRIEF = ["--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0"]
@@ -66,6 +67,19 @@ def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, t
     assert "nothing to do" in capsys.readouterr().err
     assert finetune(capture, models / kind, out, "--seed", "1") == 2
     assert "differs in seed" in capsys.readouterr().err
+
+
+def test_a_run_that_keeps_its_first_weights_says_so_and_compares_nothing(
+    capture, models, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": 20.0})
+    assert finetune(capture, models / "views", tmp_path / "mine", "--validate-every", "1") == 0
+    said = capsys.readouterr()
+    assert "camera 'cam02' and the last frame (from" in said.err, "before the run begins"
+    assert "up to 20 minutes; the comparison by camera comes after them" in said.err
+    assert f"kept the first weights: the result is '{models / 'views'}' unchanged" in said.out
+    assert "minutes" in said.out and "| camera |" not in said.out
+    assert not (tmp_path / "mine/comparison.png").exists()
 
 
 def test_a_model_in_the_folder_is_not_overwritten(capture, models, tmp_path, capsys):

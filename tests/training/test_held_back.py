@@ -3,6 +3,8 @@
 import shutil
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from reference.ball import BallCapture, ring
@@ -11,13 +13,21 @@ from reference.shared_scenes import TAKES
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 
 from viewmend.data.errors import CaptureError
+from viewmend.data.images import write_image
 from viewmend.metrics.lpips import load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.scenes.capture_scenes import make_splits, read_splits, splits_json
 from viewmend.training import held_back
 from viewmend.training.config import TrainConfig
-from viewmend.training.held_back import AUTO, HeldBack, HeldBackValidation, compare, held_back_views
+from viewmend.training.held_back import (
+    AUTO,
+    HeldBack,
+    HeldBackValidation,
+    KeptWeights,
+    compare,
+    held_back_views,
+)
 from viewmend.training.loop import train
 from viewmend.training.scenes import rig_source
 from viewmend.training.views import ViewsObjectiveConfig
@@ -40,6 +50,41 @@ def test_the_middle_camera_and_the_last_tenth_are_held_back():
         HeldBack.of(capture, "front")
     with pytest.raises(CaptureError, match="at least 5 cameras to hold one back, got 4"):
         HeldBack.of(small, "c0")
+
+
+def test_what_is_held_back_is_described():
+    capture = BallCapture(ring(5), frames=31)
+    text = HeldBack.of(capture, AUTO).describe(capture)
+    assert "camera 'c2' and the last 4 frames" in text and "are held out" in text
+    one_frame = BallCapture(ring(5), frames=1)
+    assert "camera 'c2' is held out" in HeldBack.of(one_frame, AUTO).describe(one_frame)
+
+
+def test_a_camera_with_an_empty_mask_is_not_held_back_and_has_no_row(balls, tmp_path):
+    folder = shutil.copytree(balls / "ada", tmp_path / "ada")
+    for file in sorted((folder / "mask/c2").iterdir()) + sorted((folder / "mask/c4").iterdir()):
+        write_image(file, np.zeros(cv2.imread(str(file), 0).shape, np.uint8))
+    table = [view.camera for view in held_back_views(folder, AUTO, table=True)]
+    assert table[0] == "c1", "the camera next to the middle one"
+    assert sorted(table) == ["c0", "c1", "c3"]
+
+
+def validations(*scores):
+    return [(60 * n, {"score": s, "psnr_whole": s + 8, "lpips_subject": 0.2}) for n, s in enumerate(scores)]
+
+
+def test_the_report_says_which_weights_were_kept_and_why():
+    kept = KeptWeights.of(validations(20.0, 20.5, 20.55, 20.2))
+    assert (kept.step, kept.steps) == (60, 180)
+    (text,) = kept.describe("views", 60)
+    assert "kept the weights of step 60 of 180" in text and "PSNR 28.00 to 28.50 dB" in text
+    first = KeptWeights.of(validations(20.0, 20.05, 19.0))
+    assert first.step == 0
+    (text,) = first.describe("views", 60)
+    assert "kept the first weights: the result is 'views' unchanged" in text and "+0.05" in text
+    brief = KeptWeights.of([*validations(20.0), (46, {"score": 19.9})])
+    assert "46 steps are too few to judge" in brief.describe("views", 60)[1]
+    assert KeptWeights.of([]) is None
 
 
 def test_training_never_sees_what_is_held_back(balls):

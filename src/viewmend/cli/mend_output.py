@@ -189,8 +189,13 @@ def in_words(summary: MendSummary) -> list[str]:
         ours = summary.mean("ours", metric)
         telea = summary.mean("telea", metric)
         lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
-    lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
-    return [
-        *lines,
-        f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}",
+    ours = summary.mean("ours", "lpips_alex_whole")
+    if ours is None:
+        return lines
+    rendered = summary.mean("unfilled", "lpips_alex_whole")
+    subject = summary.mean("ours", "lpips_alex_subject")
+    lines += [
+        "LPIPS (AlexNet), lower is better",
+        f"  whole image           {ours:.3f}   rendered {rendered:.3f}",
     ]
+    return lines if subject is None else [*lines, f"  subject               {subject:.3f}"]

@@ -1,5 +1,6 @@
 """`viewmend train`: run a recipe, or resume a run."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -90,42 +91,68 @@ def run(options: Options) -> int:
     def report(step: "Progress") -> None:
         steps[:] = [step]
 
+    first = os.environ.get("RANK", "0") == "0"  # torchrun's other processes report no steps
+    if first:
+        _announce_held_out(options.config)
+    began_s = time.monotonic()
     heartbeat = Heartbeat(lambda: _line(steps[0]) if steps else "making the first samples")
     with heartbeat, stop_requests() as stopped:
         try:
             train(options.config, options.out, report=report, stopped=lambda: stopped() > 0)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
-    number = stopped()
-    if number:
-        say(
-            f"{options.out}: stopped after step {steps[0].step if steps else 0}; run the same command to resume"
-        )
+    trained_s = time.monotonic() - began_s
+    if number := stopped():
+        done = steps[0].step if steps else 0
+        say(f"{options.out}: stopped after step {done}; run the same command to resume")
         return 128 + number
-    if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
+    if first:
         say(f"wrote {options.out}" if steps else f"{options.out}: this run is complete; nothing to do")
-        _show_gain(options)
+        _show_gain(options, trained_s)
     return 0
 
 
-def _show_gain(options: Options) -> None:
-    """Print the scores before and after fine-tuning, by camera, and write a contact sheet."""
+def _announce_held_out(config: TrainConfig) -> None:
+    """Before fine-tuning: which camera and frames are held out, and what the time limit includes."""
+    from viewmend.cli.console import say
+    from viewmend.training.held_back import open_training_captures
+
+    hold_out = config.scenes.hold_out
+    if hold_out is None or not config.scenes.captures:
+        return
+    for place in config.scenes.captures:
+        for opened in open_training_captures(place, hold_out):
+            assert opened.held_back is not None, "something is held out"
+            say(opened.held_back.describe(opened.source))
+    if config.minutes is not None:
+        say(f"training takes up to {config.minutes:g} minutes; the comparison by camera comes after them")
+
+
+def _show_gain(options: Options, trained_s: float) -> None:
+    """After fine-tuning: what was kept and why, and the scores before and after by camera with a contact sheet."""
     scenes = options.config.scenes
     start = options.config.start
     if scenes.hold_out is None or start is None or not scenes.captures:
         return
     from viewmend.cli.console import say
     from viewmend.models.checkpoint import load_inpainter
-    from viewmend.training.held_back import compare
+    from viewmend.training.held_back import KeptWeights, compare
+    from viewmend.training.run_files import read_validations
 
+    kept = KeptWeights.of(read_validations(options.out))
+    for text in [] if kept is None else kept.describe(start, options.config.validate_every):
+        print(text)
+    if kept is not None and kept.step == 0:
+        print(f"took {trained_s / 60:.1f} minutes; there is nothing to compare")
+        return
     sheet = options.out / "comparison.png"
     say("comparing both models by camera")
-    print(
-        compare(
-            scenes.captures[0], scenes.hold_out, load_inpainter(start), load_inpainter(options.out), sheet
-        )
-    )
+    began_s = time.monotonic()
+    before = load_inpainter(start)
+    print(compare(scenes.captures[0], scenes.hold_out, before, load_inpainter(options.out), sheet))
     print(f"views before and after: {sheet}")
+    compared_s = time.monotonic() - began_s
+    print(f"took {trained_s / 60:.1f} minutes of training and {compared_s / 60:.1f} of comparison")
 
 
 def _line(progress: "Progress") -> str:

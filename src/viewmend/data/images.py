@@ -15,6 +15,11 @@ from viewmend.data.containers import read_bytes
 from viewmend.data.errors import CaptureError
 from viewmend.utils.atomic_writes import write_atomically
 
+try:
+    import pillow_heif
+except ImportError:  # an extra: HEIC images are then refused by name
+    pillow_heif = None
+
 DEPTH_UNITS_PER_M = 1000
 """Depth is stored as 16-bit whole millimetres."""
 MAX_DEPTH_M = 65.535
@@ -34,6 +39,13 @@ OPAQUE_ALPHA = 128
 """An alpha channel is a mask only if some pixel is below this value of 255."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+"""HEIC and HEIF files, as phones write them, have one of these at byte 8, after "ftyp"."""
+HEIF_REFUSED = (
+    "expected an image that OpenCV reads, got HEIC, which needs pillow-heif; install viewmend[heic], or convert "
+    "the images to JPEG or PNG"
+)
+"""Messages about HEIC images say this if the extra is not installed."""
 RUN_LENGTH_SUFFIX = ".bin"
 """Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then
 the end of each run."""
@@ -259,16 +271,45 @@ def _read_file(path: Path, where: str) -> bytes:
 
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
-    size = size_from_header(data)
+    if is_heif(data) and pillow_heif is None:
+        raise CaptureError(f"{where}: {HEIF_REFUSED}")
+    size = heif_size_px(data) if is_heif(data) else size_from_header(data)
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         most = f"{MAX_PIXELS / 1e6:.0f} million pixels"
         got = f"{size[0]} x {size[1]}"
         raise CaptureError(f"{where}: expected an image of at most {most}, got {got}; reduce its size")
-    image = decode_image(data, flags)
+    image = _decode_heif(data, flags) if is_heif(data) else decode_image(data, flags)
     if image is None:
         got = f"{len(data)} bytes that are not an image or are truncated"
         raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
     return image
+
+
+def is_heif(data: bytes) -> bool:
+    """Whether image data is HEIC or HEIF."""
+    return data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS
+
+
+def heif_size_px(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a whole HEIF file as it is shown; None if it is damaged, or without pillow-heif."""
+    if pillow_heif is None:
+        return None
+    try:
+        return pillow_heif.open_heif(data).size
+    except (ValueError, RuntimeError, OSError, EOFError, SyntaxError):  # one of them, by what is damaged
+        return None
+
+
+def _decode_heif(data: bytes, flags: int) -> np.ndarray | None:
+    """Decode HEIF data as OpenCV would, turned as the file says; None if it is damaged."""
+    assert pillow_heif is not None, "the caller checked"
+    try:
+        image = pillow_heif.open_heif(data).to_pillow()
+    except (ValueError, RuntimeError, OSError, EOFError, SyntaxError):
+        return None
+    if flags == cv2.IMREAD_UNCHANGED and image.mode == "RGBA":
+        return cv2.cvtColor(np.asarray(image), cv2.COLOR_RGBA2BGRA)
+    return cv2.cvtColor(np.asarray(image.convert("RGB")), cv2.COLOR_RGB2BGR)
 
 
 def decode_image(data: bytes, flags: int) -> np.ndarray | None:

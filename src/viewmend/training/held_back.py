@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from viewmend.data.capture_folder import CaptureFolder
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_image
-from viewmend.data.prepare import open_masked, prepare
+from viewmend.data.prepare import first_with_subject, open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.frame_cache import CachedFrame
 from viewmend.metrics.image_quality import psnr
@@ -42,6 +42,8 @@ MIN_GAIN_DB = 0.1
 """Better weights have a score that is higher by at least this: smaller gains are chance on a few views."""
 PATIENCE = 6
 """Validations without a new best score after which a run ends."""
+FEW_VALIDATIONS = 2
+"""A run with fewer validations than this, at the recipe's interval, is too short to judge."""
 PADDING_PX = 8
 TILE_PX = (320, 480)
 
@@ -57,7 +59,7 @@ class HeldBack:
 
     @classmethod
     def of(cls, capture: CaptureSource, camera: str | None) -> "HeldBack":
-        """This camera, with `AUTO` the middle one of the rig, or none, and the last tenth of the frames.
+        """This camera, or with `AUTO` the middle one of those that see the subject, and the last frames.
 
         Raises:
             CaptureError: there is no such camera, or too few others.
@@ -76,8 +78,31 @@ class HeldBack:
                 f"{capture.name}: expected at least {MIN_CAMERAS} cameras to hold one back, got {len(names)}; omit "
                 "--hold-out to hold back only the last frames"
             )
-        chosen = names[len(names) // 2] if camera == AUTO else camera
-        return cls(chosen if len(names) >= MIN_CAMERAS else None, first_frame)
+        if len(names) < MIN_CAMERAS:
+            return cls(None, first_frame)
+        return cls(_middle_camera(capture) if camera == AUTO else camera, first_frame)
+
+    def describe(self, capture: CaptureSource) -> str:
+        """What is held back, as a sentence."""
+        count = len(capture.frame_ids)
+        parts = [] if self.camera is None else [f"camera '{self.camera}'"]
+        if count > 1:
+            late = count - self.first_frame
+            last = "the last frame" if late == 1 else f"the last {late} frames"
+            parts.append(f"{last} (from '{capture.frame_ids[self.first_frame]}' on)")
+        what = " and ".join(parts) or "nothing"
+        return f"{capture.name}: {what} {'is' if len(parts) < 2 else 'are'} held out, for validation only"
+
+
+def _middle_camera(capture: CaptureSource) -> str:
+    """The camera in the middle of the rig's list, or the nearest one to it whose mask shows the subject."""
+    names = capture.cameras.names
+    frame = first_with_subject(capture)
+    middle = sorted(names, key=lambda name: abs(names.index(name) - len(names) // 2))
+    if frame is None:
+        return middle[0]
+    seeing = {name for name in frame.cameras.names if frame.select([name]).has_subject}
+    return next((name for name in middle if name in seeing), middle[0])
 
 
 @dataclass(frozen=True)
@@ -194,7 +219,9 @@ def _views_of(capture: CaptureFolder, own: HeldBack, table: bool) -> Iterator[He
         others = tuple(name for name in names if name != camera)
         prepared = prepare(capture, others)
         frame = prepared.read(time)
-        if camera not in frame.cameras.names or len(frame.cameras) < 3 or not frame.has_subject:
+        if camera not in frame.cameras.names or len(frame.cameras) < 3:
+            continue
+        if not frame.select([camera]).has_subject:  # there is nothing to score
             continue
         seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
@@ -245,6 +272,57 @@ class HeldBackValidation:
         write_image(image, contact_sheet(rows[:4], *TILE_PX))
         psnr_db, lpips = (sum(getattr(s, name) for s, _ in made) / len(made) for name in ("psnr_db", "lpips"))
         return {"psnr_whole": psnr_db, "lpips_subject": lpips, "score": psnr_db - LPIPS_DB * lpips}
+
+
+def is_better(score: float, best: float | None) -> bool:
+    """Whether weights with this score replace those with the best score so far."""
+    return best is None or score >= best + MIN_GAIN_DB
+
+
+@dataclass(frozen=True)
+class KeptWeights:
+    """The weights that a run kept, by its validations."""
+
+    step: int
+    """The step after which they were reached; 0 for those that the run started from."""
+    steps: int
+    """The last step that was validated."""
+    first: dict[str, float | None]
+    """Scores of the weights that the run started from."""
+    kept: dict[str, float | None]
+    """Scores of the kept weights."""
+    largest_gain: float
+    """The largest gain of the score over the first weights."""
+
+    @classmethod
+    def of(cls, validations: Sequence[tuple[int, dict[str, float | None]]]) -> "KeptWeights | None":
+        """The kept weights, by the steps and scores of all validations; None without any score."""
+        scored = [(step, scores, scores["score"]) for step, scores in validations if "score" in scores]
+        scored = [(step, scores, score) for step, scores, score in scored if score is not None]
+        if not scored:
+            return None
+        kept_step, kept, best = scored[0]
+        for step, scores, score in scored[1:]:
+            if is_better(score, best):
+                kept_step, kept, best = step, scores, score
+        gains = [score - scored[0][2] for _, _, score in scored[1:]]
+        return cls(kept_step, scored[-1][0], scored[0][1], kept, max(gains, default=0.0))
+
+    def describe(self, start: str, validate_every: int) -> list[str]:
+        """What was kept, and why, as sentences; `start` names the model that the run started from."""
+        few = self.steps < FEW_VALIDATIONS * validate_every
+        advice = f"{self.steps} steps are too few to judge: give more --minutes, or use a GPU"
+        if self.step == 0:
+            why = f"no validation scored at least {MIN_GAIN_DB:g} higher (largest change {self.largest_gain:+.2f})"
+            text = f"kept the first weights: the result is '{start}' unchanged, because in {self.steps} steps {why}"
+            return [text, advice] if few else [text]
+        pairs = [(self.first.get(name), self.kept.get(name)) for name in ("psnr_whole", "lpips_subject")]
+        scores = ""
+        if all(value is not None for pair in pairs for value in pair):
+            (psnr_before, psnr_after), (lpips_before, lpips_after) = pairs
+            scores = f": PSNR {psnr_before:.2f} to {psnr_after:.2f} dB, LPIPS {lpips_before:.4f} to {lpips_after:.4f}"
+        text = f"kept the weights of step {self.step} of {self.steps}, which score best on what was held out{scores}"
+        return [text, advice] if few else [text]
 
 
 def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:

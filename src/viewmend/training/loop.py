@@ -14,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from viewmend.models.network import faster_dtype
 from viewmend.training.config import TrainConfig
-from viewmend.training.held_back import MIN_GAIN_DB, PATIENCE, HeldBackValidation
+from viewmend.training.held_back import PATIENCE, HeldBackValidation, is_better
 from viewmend.training.objective import StepOutput
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import (
@@ -311,7 +311,7 @@ class Run:
         self.validated = scores
         score = scores.get("score")
         best = self.state.best_score
-        if self.keeps_best and score is not None and (best is None or score >= best + MIN_GAIN_DB):
+        if self.keeps_best and score is not None and is_better(score, best):
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(step)
 

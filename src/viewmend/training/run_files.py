@@ -242,6 +242,14 @@ class Log:
                 self._board.add_scalar(f"{group}/{name}", value, step)
 
 
+def read_validations(out: Path) -> list[tuple[int, dict[str, float | None]]]:
+    """The steps and scores of all validations in the log of the run in `out`; empty without a log."""
+    path = out / "log.jsonl"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    entries = [json.loads(line) for line in lines]
+    return [(entry["step"], entry["validation"]) for entry in entries if "validation" in entry]
+
+
 def _is_later(line: str, step: int) -> bool:
     """Whether a line of the log belongs to a later step; lines without a step do not."""
     try:

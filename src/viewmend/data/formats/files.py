@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from viewmend.data.containers import read_bytes, stored_path
-from viewmend.data.images import size_from_header
+from viewmend.data.images import HEIF_REFUSED, heif_size_px, is_heif, pillow_heif, size_from_header
 from viewmend.data.native_format import stays_inside
 from viewmend.data.video_clock import match_tracks, video_track
 from viewmend.data.videos import is_video, video_properties
@@ -47,6 +47,8 @@ IMAGE_SUFFIXES = (
         ".tiff",
         ".webp",
         ".avif",
+        ".heic",
+        ".heif",
         ".gif",
         ".exr",
     ),
@@ -90,7 +92,11 @@ def image_size_px(folder: Path, name: str) -> tuple[int, int]:
     size = None
     if stays_inside(name):
         with suppress(OSError):
-            size = size_from_header(read_bytes(folder / stored_path(folder, name), HEADER_BYTES))
+            path = folder / stored_path(folder, name)
+            header = read_bytes(path, HEADER_BYTES)
+            if is_heif(header) and pillow_heif is None:
+                raise ValueError(f"{name[:200]!r}: {HEIF_REFUSED}")
+            size = heif_size_px(read_bytes(path)) if is_heif(header) else size_from_header(header)
     if size is None:
         raise ValueError(
             f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file"
