@@ -1,7 +1,7 @@
 """One clock for all films of a capture: which frame of each film shows what the others show at the same time."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -225,38 +225,18 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
     tracks, timecodes = _by_timecode(tracks)
     images = {track.camera: track for track in tracks if track.kind == "images"}
-    order = sorted(
-        images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True
-    )
-    rate = round(order[len(order) // 2].fps or 0.0, 1)
-    reference = next(track for track in order if round(track.fps or 0.0, 1) == rate)
+    reference = _choose_reference(images.values())
     period_s = 1 / (reference.fps or 1.0)
-    moved = set()
-    by_index = set()
-    for number, track in enumerate(tracks):
-        peer = reference if track.kind == "images" else images[track.camera]
-        early_s = peer.times_s[0] - track.times_s[-1]
-        late_s = track.times_s[0] - peer.times_s[-1]
-        if track.kind == "masks" and len(track.times_s) == len(peer.times_s):
-            if np.abs(np.diff(track.times_s - peer.times_s)).max(initial=0.0) > TOLERANCE * period_s:
-                by_index.add(track.camera)
-            tracks[number] = replace(track, times_s=peer.times_s)
-        elif max(early_s, late_s) > period_s:
-            moved.add((track.camera, track.kind))
-            tracks[number] = replace(track, times_s=track.times_s + float(peer.times_s[0] - track.times_s[0]))
-        if track.kind == "images":
-            images[track.camera] = tracks[number]
+    tracks, moved, by_index = _overlap(tracks, images, reference)
     centred = [track.times_s - _phase_s(track.times_s, reference.times_s, period_s) for track in tracks]
-    times = reference.times_s
-    for track, own in zip(tracks, centred, strict=True):
-        if track.kind == "images":
-            far = np.abs(own - times[_nearest(times, own)]) > NEW_TIME * period_s
-            times = np.sort(np.concatenate([times, own[far]]))
+    times = _fill_gaps(reference.times_s, tracks, centred, period_s)
     found: dict[tuple[str, TrackKind], np.ndarray] = {}
     for track, own in zip(tracks, centred, strict=True):
         index = _nearest(own, times)
         is_near = np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6
         found[track.camera, track.kind] = np.where(is_near, index, ABSENT)
+
+    # Keep the times at which two cameras or more have all of their frames
     complete = [
         np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images
     ]
@@ -267,13 +247,62 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
         )
     times = times[kept]
     frames = {key: index[kept] for key, index in found.items()}
-    ends = [
+    end_s = min(
         own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)
-    ]
-    end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
-    return VideoClock(
-        tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index), timecodes
     )
+    end = max(1, int((times < end_s - TOLERANCE * period_s).sum()))
+    return VideoClock(tuple(tracks), reference.fps, times, end, frames, moved, by_index, timecodes)
+
+
+def _choose_reference(images: Collection[Track]) -> Track:
+    """The longest film of the highest rate that at least half of the cameras reach."""
+    order = sorted(images, key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
+    rate = round(order[len(order) // 2].fps or 0.0, 1)
+    return next(track for track in order if round(track.fps or 0.0, 1) == rate)
+
+
+def _overlap(
+    tracks: Sequence[Track], images: Mapping[str, Track], reference: Track
+) -> tuple[list[Track], frozenset[tuple[str, TrackKind]], frozenset[str]]:
+    """Move films that have no time in common with the others to start with them; masks follow their images.
+
+    Returns the films, those that were moved, and the cameras whose masks were matched to the images
+    one to one.
+    """
+    period_s = 1 / (reference.fps or 1.0)
+    images = dict(images)
+    overlapping = list(tracks)
+    moved = set()
+    by_index = set()
+    for number, track in enumerate(tracks):
+        peer = reference if track.kind == "images" else images[track.camera]
+        early_s = peer.times_s[0] - track.times_s[-1]
+        late_s = track.times_s[0] - peer.times_s[-1]
+        if track.kind == "masks" and len(track.times_s) == len(peer.times_s):
+            if np.abs(np.diff(track.times_s - peer.times_s)).max(initial=0.0) > TOLERANCE * period_s:
+                by_index.add(track.camera)
+            overlapping[number] = replace(track, times_s=peer.times_s)
+        elif max(early_s, late_s) > period_s:
+            moved.add((track.camera, track.kind))
+            shift_s = float(peer.times_s[0] - track.times_s[0])
+            overlapping[number] = replace(track, times_s=track.times_s + shift_s)
+        if track.kind == "images":
+            images[track.camera] = overlapping[number]
+    return overlapping, frozenset(moved), frozenset(by_index)
+
+
+def _fill_gaps(
+    times_s: Float64[np.ndarray, "time"],
+    tracks: Sequence[Track],
+    centred: Sequence[Float64[np.ndarray, "_frame"]],
+    period_s: float,
+) -> Float64[np.ndarray, "new_time"]:
+    """Add the times of images that are far from all times so far; `centred` are the films' times."""
+    for track, own in zip(tracks, centred, strict=True):
+        if track.kind == "images":
+            far = np.abs(own - times_s[_nearest(times_s, own)]) > NEW_TIME * period_s
+            times_s = np.sort(np.concatenate([times_s, own[far]]))
+    return times_s
 
 
 def _with_known_rates(tracks: Sequence[Track]) -> list[Track]:

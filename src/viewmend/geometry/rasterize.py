@@ -169,7 +169,11 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
         key = torch.where(inverse > 0, key, -1)
         keys.scatter_reduce_(0, (view[owner] * height + uv[:, 1]) * width + uv[:, 0], key, "amax")
 
-    keys = keys.view(len(cameras), height, width)
+    return _unpack_keys(keys.view(len(cameras), height, width))
+
+
+def _unpack_keys(keys: Int[Tensor, "view height width"]) -> Raster:
+    """Depth and triangle of each pixel from its key; -1 is the key of an empty pixel."""
     triangle = torch.where(keys >= 0, 0x7FFFFFFF - (keys & 0x7FFFFFFF), -1).int()
     inverse = (keys >> 32).int().view(torch.float32)
     return Raster(torch.where(keys >= 0, 1 / inverse, 0.0), triangle)

@@ -28,7 +28,7 @@ from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.compositing import Background, camera_image, composite
 from viewmend.rendering.proxy_views import hull_points, shaded_hull, vertex_colours
 from viewmend.stream import Stream, StreamConfig, StreamView
-from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.cancellation import CancelledError
 from viewmend.utils.timing import StageTimes, exact_times
 
@@ -224,8 +224,6 @@ class Renderer:
         if truth is not None:
             background = inpainter.background or self._config.background
             psnr_db, extra[0]["error"] = self._score(scored, truth, background)
-        rendered = completed[0].view
-        is_predicted = request.quality.mend and request.quality.refine_fraction != 0
         return RenderResult(
             time=request.time,
             completed=tuple(completed),
@@ -233,9 +231,14 @@ class Renderer:
             times=times,
             background=self.background,
             extra=extra,
-            input_views=self._inpainter.source_names(rendered) if is_predicted else rendered.source_views,
+            input_views=self._input_views(completed[0].view, request.quality),
             psnr_db=psnr_db,
         )
+
+    def _input_views(self, rendered: IncompleteView, quality: RenderQuality) -> tuple[str, ...]:
+        """Names of the cameras that a view is made from: the model's, or those that colour the rendered view."""
+        is_predicted = quality.mend and quality.refine_fraction != 0
+        return self._inpainter.source_names(rendered) if is_predicted else rendered.source_views
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
         """Those of these names that are cameras of the rig, in its order; ValueError if fewer than two are left."""

@@ -87,31 +87,38 @@ def vertex_colours(proxy: GeometryProxy, views: ContextViews) -> Float[Tensor, "
     Unseen vertices take the colour of the nearest coloured vertices along the mesh.
     """
     vertices = proxy.mesh.vertices
-    frame = views.frame
-    bias_m = BIAS * float(proxy.bounds.size_m.norm())
     total = vertices.new_zeros(len(vertices), 4)
-    for view in range(len(frame.cameras)):
-        # sample the camera at the vertices
-        camera = frame.cameras[view]
-        uv, z = project(vertices, camera)
-        rgb = frame.rgb[view].to(vertices) / 255
-        depth = views.depth[view]
-        mask = (depth > 0).to(rgb) if frame.mask is None else frame.mask[view].to(rgb) / 255
-        sample = sample_bilinear(torch.cat([rgb * mask, mask[None]])[None], uv)[0]
-        column, row = uv[0].long().unbind(-1)
-        surface = depth[row.clamp(0, depth.shape[0] - 1), column.clamp(0, depth.shape[1] - 1)]
-
-        # add the colours of the visible ones, by their angle to the camera
-        visible = (
-            in_view(uv, z, camera)[0] & (surface > 0) & (z[0] <= surface + bias_m) & (sample[:, 3] > MIN_MASK)
-        )
-        to_camera = F.normalize(camera.centers - vertices, dim=-1)
-        weight = visible * (proxy.normals * to_camera).sum(-1).clamp(min=0) ** FRONTAL_POWER
-        colour = sample[:, :3] / sample[:, 3:].clamp(min=MIN_MASK)
-        total += weight[:, None] * torch.cat([colour, torch.ones_like(z.mT)], 1)
+    for view in range(len(views.frame.cameras)):
+        total += _weighted_colours(proxy, views, view)
     known = total[:, 3] > MIN_WEIGHT
     mean = total[:, :3] / total[:, 3:].clamp(min=MIN_WEIGHT)
     return _spread(torch.where(known[:, None], mean, GREY), known, proxy.mesh)
+
+
+def _weighted_colours(proxy: GeometryProxy, views: ContextViews, view: int) -> Float[Tensor, "vertex 4"]:
+    """Colours of the vertices in one camera, times their weights, and the weights; 0 where it does not see them."""
+    vertices = proxy.mesh.vertices
+    frame = views.frame
+    bias_m = BIAS * float(proxy.bounds.size_m.norm())
+
+    # Sample the camera at the vertices
+    camera = frame.cameras[view]
+    uv, z = project(vertices, camera)
+    rgb = frame.rgb[view].to(vertices) / 255
+    depth = views.depth[view]
+    mask = (depth > 0).to(rgb) if frame.mask is None else frame.mask[view].to(rgb) / 255
+    sample = sample_bilinear(torch.cat([rgb * mask, mask[None]])[None], uv)[0]
+    column, row = uv[0].long().unbind(-1)
+    surface = depth[row.clamp(0, depth.shape[0] - 1), column.clamp(0, depth.shape[1] - 1)]
+
+    # Weigh the visible ones by their angle to the camera
+    visible = (
+        in_view(uv, z, camera)[0] & (surface > 0) & (z[0] <= surface + bias_m) & (sample[:, 3] > MIN_MASK)
+    )
+    to_camera = F.normalize(camera.centers - vertices, dim=-1)
+    weight = visible * (proxy.normals * to_camera).sum(-1).clamp(min=0) ** FRONTAL_POWER
+    colour = sample[:, :3] / sample[:, 3:].clamp(min=MIN_MASK)
+    return weight[:, None] * torch.cat([colour, torch.ones_like(z.mT)], 1)
 
 
 def _draw(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.data.colour_matching import SurfaceColours, SurfacePoints, agreement, best_agreement
@@ -61,6 +61,17 @@ class OtherSubjectRule:
     min_cameras: int = 5
     """The rig has at least this many cameras: medians of fewer say little."""
 
+    def applies(
+        self, distance: Float[Tensor, "view"], correlation: Float[Tensor, "view"]
+    ) -> Bool[Tensor, "view"]:
+        """Find the images to which the rule applies, by their distance from and best correlation with the others."""
+        typical = distance.nanmedian()
+        farther = distance > self.lower_ratio * typical
+        unlike = correlation < self.max_correlation * correlation.nanmedian()
+        is_large = len(distance) >= self.min_cameras
+        far = (distance > self.ratio * typical) | (farther & unlike & is_large)
+        return far & (distance > self.min_distance)
+
 
 def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
     """Find cameras whose images do not match the others'; empty if they cannot be compared."""
@@ -75,14 +86,10 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     colours = surface.colours(small.rgb)
     distance, correlation = best_agreement(colours)
     typical = distance.nanmedian()
-    alike = correlation.nanmedian()
     suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
     better = _find_better_fits(small, surface, colours, distance, suspects)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
-    rule = OtherSubjectRule()
-    farther = (distance > rule.lower_ratio * typical) & (correlation < rule.max_correlation * alike)
-    enough = len(distance) >= rule.min_cameras
-    far = ((distance > rule.ratio * typical) | (farther & enough)) & (distance > rule.min_distance)
+    other_subject = OtherSubjectRule().applies(distance, correlation)
     blurred = detail < BLURRED * detail.nanmedian()
     noisy = detail > NOISY * detail.nanmedian()
     mismatch = "its images do not match those of the other cameras"
@@ -92,7 +99,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
             texts[view] = "its images are grey, but the others' are not; check its settings"
         elif view in better:
             texts[view] = f"{mismatch}, and fit much better {better[view]}; correct its files"
-        elif bool(far[view]):
+        elif bool(other_subject[view]):
             texts[view] = (
                 f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, typically by {100 * typical:.0f} %); "
                 "check whether they are from another camera or frame, rotated, mirrored, BGR or of another exposure"

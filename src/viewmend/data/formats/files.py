@@ -325,6 +325,19 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(shown) + (f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else "")
 
 
+def _choose_videos(folder: Path, paths: dict[str, str]) -> dict[str, str]:
+    """The paths, with each folder of a single video replaced by the video; ValueError for a folder of several."""
+    found = {name: _videos_of_subject(folder, path) for name, path in paths.items()}
+    several = {
+        name: videos
+        for name, videos in found.items()
+        if len(videos) > 1 and not list_images(folder, paths[name])
+    }
+    if several:
+        raise ValueError(_several_videos(several))
+    return {name: found[name][0] if len(found[name]) == 1 else path for name, path in paths.items()}
+
+
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """Collect the footage of cameras whose videos or folders of images are known, by name, and find their masks.
 
@@ -337,15 +350,7 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     entries = {}
     ids = {}
     ignored = []
-    shown = {name: _videos_of_subject(folder, path) for name, path in paths.items()}
-    several = {
-        name: found
-        for name, found in shown.items()
-        if len(found) > 1 and not list_images(folder, paths[name])
-    }
-    if several:
-        raise ValueError(_several_videos(several))
-    paths = {name: shown[name][0] if len(shown[name]) == 1 else path for name, path in paths.items()}
+    paths = _choose_videos(folder, paths)
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
         video = videos.get(name)

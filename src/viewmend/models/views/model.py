@@ -50,7 +50,7 @@ from viewmend.models.views.prediction import (
 )
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.models.views.sampler import Rays, RayStatistics, choose_cameras, sample_rays
+from viewmend.models.views.sampler import Rays, RaySamples, RayStatistics, choose_cameras, sample_rays
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
@@ -342,13 +342,10 @@ class ViewSynthNet(Network):
         rays = Rays(view, scale, pixels.flip(1).double() + 0.5, surface.depth.detach()[:, None], cameras)
         samples = sample_rays(rays, sources, step_px=1.0, cubic=True)
 
-        # Weigh the cameras, beginning with the trust that they have in the pixel's cell
+        # Weigh the cameras
         stop_if_cancelled()
-        prior = distribution.samples.trust[surface.cell, surface.hypothesis]
-        with self.autocast():
-            aggregated = self.pixel_aggregator(samples, prior[:, None])
+        aggregated = self._aggregate_pixels(samples, surface, distribution)
         mask = aggregated.mask[:, 0]
-        trust = aggregated.trust[:, 0]
 
         # Score the candidate colours and the gains of detail by the last convolutions
         colours = candidate_colours(samples.features[:, 0], aggregated, image, pixels, distribution)
@@ -360,15 +357,30 @@ class ViewSynthNet(Network):
 
         # Blend the colours, then add detail
         blended = (scores.softmax(1)[..., None] * colours.stacked()).sum(1)
-        alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask[:, 0] - 0.5)).sigmoid()
-        confidence = confidence_logit[:, 0].sigmoid()
         detailed = torch.stack([blended, colours.single, colours.guess], 1)
-        weight = mask[:, 0].clamp_min(MIN_DETAIL_WEIGHT)
         magnification = sources.magnification(view.camera, scale)
-        bands = detail_bands(detailed, weight, pixels, view.mask.shape, magnification)
-        detail = (gains.unflatten(1, bands.shape[1:3])[..., None] * bands).sum((1, 2))
+        detail = amplify_detail(detailed, mask[:, 0], gains, pixels, view.mask.shape, magnification)
+
+        # Composite on black
+        alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask[:, 0] - 0.5)).sigmoid()
         rgb = alpha[:, None] * (blended + detail).clamp(0, 1)
-        return ViewPrediction(pixels, rgb, alpha, confidence, surface.depth, trust, distribution)
+        return ViewPrediction(
+            pixels,
+            rgb,
+            alpha,
+            confidence_logit[:, 0].sigmoid(),
+            surface.depth,
+            aggregated.trust[:, 0],
+            distribution,
+        )
+
+    def _aggregate_pixels(
+        self, samples: RaySamples, surface: SurfacePoints, distribution: DepthDistribution
+    ) -> AggregatedSamples:
+        """Weighs the cameras at each pixel, beginning with the trust that they have in its cell."""
+        prior = distribution.samples.trust[surface.cell, surface.hypothesis]
+        with self.autocast():
+            return self.pixel_aggregator(samples, prior[:, None])
 
     def _blending_layers(
         self,
@@ -386,6 +398,19 @@ class ViewSynthNet(Network):
             out = self.blending(concatenate_channels(near, scatter_to_image(inputs.to(near), pixels, shape)))
         rows, columns = pixels.unbind(1)
         return out[0, :, rows, columns].T.float()
+
+
+def amplify_detail(
+    colours: Float[Tensor, "pixel image 3"],
+    mask: Float[Tensor, "pixel"],
+    gains: Float[Tensor, "pixel gain"],
+    pixels: Pixels,
+    shape: torch.Size,
+    magnification: float,
+) -> Float[Tensor, "pixel 3"]:
+    """The bands of detail of these images times their gains, summed; `mask` weighs the local means."""
+    bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)
+    return (gains.unflatten(1, bands.shape[1:3])[..., None] * bands).sum((1, 2))
 
 
 def candidate_colours(

@@ -210,6 +210,24 @@ def opposite(part: int) -> list[int]:
 def build_body(person: Physique, skeleton: Skeleton) -> Body:
     """Build the naked shape of a person in the bind pose; head, hands and feet are drawn elsewhere."""
     H = person.height_m
+    w = person.weight
+    girth = 1 + 0.10 * w + 0.10 * (person.muscle - 0.5) - 0.06 * person.femininity
+    leg_girth = 1 + 0.10 * w + 0.05 * (person.muscle - 0.5) + 0.03 * person.femininity
+
+    def pair(first: str, last: str, profile: Float[np.ndarray, "knot 3"], girth: float) -> tuple[Limb, ...]:
+        t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth * H, H]))
+        return tuple(
+            Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES
+        )
+
+    arms = pair("upperarm", "hand", ARM_PROFILE, girth)
+    legs = pair("thigh", "foot", LEG_PROFILE, leg_girth)
+    return Body(_build_torso(person), arms, legs, skeleton, H)
+
+
+def _build_torso(person: Physique) -> Torso:
+    """Build the trunk and neck of a person: the mean of both sexes' profiles, with weight and muscle added."""
+    H = person.height_m
     f = person.femininity
     w = person.weight
     y, a_m, a_f, d_m, d_f, back, z = TORSO.T
@@ -225,19 +243,7 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
     bust = (0.010 + 0.010 * f * (1 + 0.3 * w)) * f + 0.003 * (1 - f)
     bumps = [(s * 0.62, 0.722, 0.42, 0.026, bust) for s in (1, -1)]
     bumps += [(np.pi + s * 0.5, 0.51 * person.leg_share, 0.42, 0.030, 0.010 + 0.004 * f) for s in (1, -1)]
-    torso = Torso(heights, *table.T, bumps=np.array(bumps) * np.array([1, H, 1, H, H]))
-    girth = 1 + 0.10 * w + 0.10 * (person.muscle - 0.5) - 0.06 * f
-    leg_girth = 1 + 0.10 * w + 0.05 * (person.muscle - 0.5) + 0.03 * f
-
-    def pair(first: str, last: str, profile: Float[np.ndarray, "knot 3"], girth: float) -> tuple[Limb, ...]:
-        t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth * H, H]))
-        return tuple(
-            Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES
-        )
-
-    arms = pair("upperarm", "hand", ARM_PROFILE, girth)
-    legs = pair("thigh", "foot", LEG_PROFILE, leg_girth)
-    return Body(torso, arms, legs, skeleton, H)
+    return Torso(heights, *table.T, bumps=np.array(bumps) * np.array([1, H, 1, H, H]))
 
 
 def smoothstep(x: Values, low: float, high: float) -> Values:
@@ -325,7 +331,6 @@ def hand_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch
     wrist = body.skeleton.at(f"{side}_hand")
     along = -arm.frame[1]
     forward = arm.frame[2]
-    palm = np.cross(along, forward) * SIGN[side]
     s = np.linspace(1, -0.12, 12)
     reach = 0.054 * H * s
     breadth = np.interp(s, [-0.12, 0.1, 0.45, 0.8, 1.0], [0.0140, 0.0160, 0.0220, 0.0235, 0.0215]) * H * girth
@@ -334,14 +339,25 @@ def hand_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch
     grid = _tube(centers[0] + 0.006 * along, centers, forward, np.stack([breadth, thick]), 17)
     before, behind = (one_joint(grid.shape[:2], f"{side}_{name}") for name in ("forearm", "hand"))
     weights = mix(before, behind, smoothstep(arm.along(grid), 0.96, 1.03))
-    patches = [Patch(grid, unit_grid(grid.shape), weights, skin)]
+    return [Patch(grid, unit_grid(grid.shape), weights, skin), *_finger_patches(body, side, skin, girth)]
+
+
+def _finger_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch]:
+    """Draw four fingers and the thumb of a hand."""
+    H = body.height_m
+    arm = body.arms[0 if side == "left" else 1]
+    wrist = body.skeleton.at(f"{side}_hand")
+    along = -arm.frame[1]
+    forward = arm.frame[2]
+    palm = np.cross(along, forward) * SIGN[side]
+    fingers = []
     for k, length in enumerate((0.043, 0.048, 0.045, 0.036)):
         root = wrist + (0.050 * along) * H + (1.5 - k) * 0.0108 * H * girth * forward
         lean = unit(along + 0.10 * (1.5 - k) * 0.5 * forward)
-        patches.append(_finger(root, lean, palm, length * H, 0.0050 * H * girth, f"{side}_fingers", skin))
+        fingers.append(_finger(root, lean, palm, length * H, 0.0050 * H * girth, f"{side}_fingers", skin))
     root = wrist + (0.012 * along + 0.014 * forward) * H
     thumb = unit(0.78 * along + 0.62 * forward + 0.15 * palm)
-    return [*patches, _finger(root, thumb, palm, 0.045 * H, 0.0062 * H * girth, f"{side}_hand", skin)]
+    return [*fingers, _finger(root, thumb, palm, 0.045 * H, 0.0062 * H * girth, f"{side}_hand", skin)]
 
 
 def _finger(
@@ -376,16 +392,25 @@ def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Pa
     )
     # Heel and tip close to a point just above the floor.
     middle = 0.006 * H
-    close = np.clip(half / (0.012 * H), 0, 1)[:, None]
-    y = middle + (y - middle) * close
+    y = middle + (y - middle) * np.clip(half / (0.012 * H), 0, 1)[:, None]
     z = np.broadcast_to(((s - 0.25) * 0.152 * H)[:, None], x.shape)
     splay = SIGN[side] * 0.04 * H * np.maximum(s - 0.25, 0)[:, None] * 0.7
     points = np.stack([ankle[0] + x + splay, y, ankle[2] + z], -1)
+    chart = _paint_shoe(upper_rgb, sole_rgb)
+    return Patch(points, unit_grid(points.shape), _shoe_weights(body, side, points), chart)
+
+
+def _shoe_weights(body: Body, side: str, points: Points) -> Weights:
+    """Weights of a shoe's points: those in front of the toe's joint follow it."""
+    toe_z = float(body.skeleton.at(f"{side}_toe")[2])
+    soft = 0.02 * body.height_m
+    foot, tip = (one_joint(points.shape[:2], f"{side}_{name}") for name in ("foot", "toe"))
+    return mix(foot, tip, smoothstep(points[..., 2], toe_z - soft, toe_z + soft))
+
+
+def _paint_shoe(upper_rgb: Vector, sole_rgb: Vector) -> Image:
+    """Paint the chart of a shoe: upper, laces and sole."""
     u = np.linspace(0, 1, 128)[None, :, None] * 2 * np.pi
     v = np.linspace(1, 0, 96)[:, None, None]
     laces = (np.abs(np.sin(u) - 1) < 0.14) & (v > 0.42) & (v < 0.66) & ((v * 24) % 1 < 0.4)
-    chart = np.where(laces, 0.5 * sole_rgb + 0.45, np.where(np.sin(u) < 0.16, sole_rgb, upper_rgb))
-    toe = float(body.skeleton.at(f"{side}_toe")[2])
-    foot, tip = (one_joint(points.shape[:2], f"{side}_{name}") for name in ("foot", "toe"))
-    weights = mix(foot, tip, smoothstep(points[..., 2], toe - 0.02 * H, toe + 0.02 * H))
-    return Patch(points, unit_grid(points.shape), weights, chart)
+    return np.where(laces, 0.5 * sole_rgb + 0.45, np.where(np.sin(u) < 0.16, sole_rgb, upper_rgb))

@@ -136,18 +136,20 @@ def torso_sheet(
     outward = outward_of(theta)
     points = shape.settle(torso.point(theta, y), outward, 0)
     points = points + folds.crease(canvas, uv)[..., None] * outward
-    lips = []
-    for row, rise in ((0, 0.004), (-1, -0.012)):
-        inner = body.torso.point(around, y[row])
-        axis = (
-            inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y[row], torso.y, torso.z)[:, None]
-        )
-        lips.append(axis + 0.93 * (inner - axis) + np.array([0, rise, 0]))
-    points = np.concatenate([lips[0][None], points, lips[1][None]])
+    low_edge = _inner_edge(body.torso, torso, around, y[0], 0.004)
+    high_edge = _inner_edge(body.torso, torso, around, y[-1], -0.012)
+    points = np.concatenate([low_edge[None], points, high_edge[None]])
     uv = np.concatenate([uv[:1], uv, uv[-1:]])
     return Patch(
         points, uv, body_weights(body, points), folds.paint(canvas, painter), closed=_is_closed(around)
     )
+
+
+def _inner_edge(body: Torso, cloth: Torso, around: Azimuths, y: Azimuths, rise_m: float) -> Points:
+    """Points just inside the body, at which an edge of cloth ends; `rise_m` moves them along the torso."""
+    inner = body.point(around, y)
+    axis = inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y, cloth.y, cloth.z)[:, None]
+    return axis + 0.93 * (inner - axis) + np.array([0, rise_m, 0])
 
 
 def limb_sheet(

@@ -46,13 +46,18 @@ class Head:
         depth = np.maximum(np.where(cosine > 0, d, b), 1e-3)
         r = ((sine / np.maximum(a, 1e-3)) ** 2.25 + (np.abs(cosine) / depth) ** 2.25) ** (-1 / 2.25)
         turn = np.abs(np.angle(np.exp(1j * azimuth)))
+        return r + self._features(turn, y) * (np.cos(azimuth) > -0.2)
 
+    def _features(self, turn: Values, y: Values) -> Values:
+        """Relief of nose, brows, lips and the like at an angle from the middle of the face, in head heights."""
+        f = self.person.femininity
+        face = self.person.face
         ridge = np.interp(y, [0.315, 0.345, 0.37, 0.45, 0.53, 0.57], [0, 0.085, 0.112, 0.068, 0.028, 0.0])
         nose = (1 + 0.2 * face[1] - 0.1 * f) * ridge * np.exp(-((turn / (0.115 + 0.015 * face[2])) ** 2))
         features = nose
         for swelling, by_chin, by_sex, *place in TABLES["face"]:
             features = features + (swelling + by_chin * face[3] + by_sex * f) * _spot(turn, y, *place)
-        return r + features * (np.cos(azimuth) > -0.2)
+        return features
 
     def point(self, azimuth: Values, y: Values, thickness: Values | float = 0.0) -> Points:
         """World position on the head, or `thickness` head heights above it."""

@@ -16,6 +16,7 @@ from viewmend.studio.procedural.skeleton import (
     Rotation,
     Skeleton,
     Stance,
+    Vector,
     rotation,
 )
 
@@ -93,34 +94,44 @@ def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
     return np.zeros(2), score.heading
 
 
+def _foothold(score: Score, time_s: float, side: str) -> tuple[Vector, float]:
+    """Where a foot is planted when the body is above it, and the foot's heading."""
+    (x, z), heading = _path(score, time_s)
+    width = 0.10 if score.kind != "sidestep" else 0.16
+    aside = rotation(1, heading) @ np.array([SIGN[side] * width * score.height_m / 2, 0, 0])
+    return np.array([x, 0, z]) + aside, heading + SIGN[side] * 0.10
+
+
+def _swing_foot(score: Score, time_s: float, side: str, phase: float) -> FootPose:
+    """The foot of a side that steps along the path; `phase` counts its steps."""
+    run = score.kind == "run"
+    duty = 0.42 if run else 0.62
+    step = int(np.floor(phase))
+    tau = float(phase - np.floor(phase))
+
+    # Swing from this step's foothold to the next one
+    here, heading = _foothold(score, time_s + (step + duty / 2 - phase) / score.beat_hz, side)
+    there, next_heading = _foothold(score, time_s + (step + 1 + duty / 2 - phase) / score.beat_hz, side)
+    go = (tau - duty) / (1 - duty)
+    share = ease(go)
+    place = here + share * (there - here)
+    lift = {"run": 0.13, "march": 0.17, "walk": 0.045}.get(score.kind, 0.05) * score.height_m
+    place[1] += lift * np.sin(np.pi * np.clip(go, 0, 1)) ** 2
+    turn = heading + share * (next_heading - heading)
+
+    # Roll off and strike
+    roll_off = 0.45 * (ease((tau - duty + 0.16) / 0.16) - ease((go - 0.15) / 0.45)) * (go < 1)
+    strike = (0.20 * (not run)) * (ease((go - 0.6) / 0.4) + (1 - ease(tau / 0.10)) * (tau < 0.10))
+    flat = 0.4 if score.kind in ("sidestep", "turn", "spin") else 1.0
+    return FootPose(place, turn, float(strike - roll_off) * flat)
+
+
 def _step(score: Score, time_s: float, beats: float) -> Stance:
     """Step along the path: each foot is planted, lifted, and swung to where the body will be."""
     H = score.height_m
     run = score.kind == "run"
-    duty = 0.42 if run else 0.62
-    lift = {"run": 0.13, "march": 0.17, "walk": 0.045}.get(score.kind, 0.05) * H
-    width = 0.10 if score.kind != "sidestep" else 0.16
     at, yaw = _path(score, time_s)
-    feet = []
-    for i, side in enumerate(SIDES):
-        phase = beats + 0.5 * i
-        step = int(np.floor(phase))
-        tau = float(phase - np.floor(phase))
-        planted = []
-        for k in (step, step + 1):
-            when = time_s + (k + duty / 2 - phase) / score.beat_hz
-            (x, z), turn = _path(score, when)
-            aside = rotation(1, turn) @ np.array([SIGN[side] * width * H / 2, 0, 0])
-            planted.append((np.array([x, 0, z]) + aside, turn + SIGN[side] * 0.10))
-        go = (tau - duty) / (1 - duty)
-        share = ease(go)
-        place = planted[0][0] + share * (planted[1][0] - planted[0][0])
-        place[1] += lift * np.sin(np.pi * np.clip(go, 0, 1)) ** 2
-        turn = planted[0][1] + share * (planted[1][1] - planted[0][1])
-        roll_off = 0.45 * (ease((tau - duty + 0.16) / 0.16) - ease((go - 0.15) / 0.45)) * (go < 1)
-        strike = (0.20 * (not run)) * (ease((go - 0.6) / 0.4) + (1 - ease(tau / 0.10)) * (tau < 0.10))
-        flat = 0.4 if score.kind in ("sidestep", "turn", "spin") else 1.0
-        feet.append(FootPose(place, turn, float(strike - roll_off) * flat))
+    feet = [_swing_foot(score, time_s, side, beats + 0.5 * i) for i, side in enumerate(SIDES)]
     turn = 2 * np.pi * beats
     bob = (0.045 if run else 0.014) * H * np.cos(2 * turn + (0.4 if run else 2.6))
     over = rotation(1, yaw) @ np.array([0.016 * H * np.sin(turn - 0.2), 0, 0])
