@@ -65,7 +65,7 @@ COMPRESSION = 6
 """zlib's compression level of meshes and masks."""
 COMPLETED_SOURCES = 4
 """A page colours a view from this many cameras, where some of them are completed views."""
-COMPLETED_VIEW_POWER = 256
+COMPLETED_VIEW_POWER = 128
 """The exponent of the cosine between the directions to camera and viewer, where some cameras are
 completed views: they stand closer to each other than real cameras."""
 Names = tuple[str, ...]

@@ -3,7 +3,7 @@
 import { HoleFill } from "./fill.js";
 import { QUAD, buildProgram } from "./program.js";
 import { clipFromWorld } from "./projection.js";
-import { sourcesOf } from "../link/assets.js";
+import { nearness, sourcesOf } from "../link/assets.js";
 import { add, apply, multiply } from "../view/matrix.js";
 
 /** @typedef {import("../link/assets.js").Frame} Frame */
@@ -48,6 +48,7 @@ centroid in vec3 tint;
 out vec4 colour;
 uniform vec3 eye;
 uniform float bias, slope, grazing, least;
+uniform float closest;   // cosine between the directions to the viewer and to the closest camera; 1 where weights are absolute
 uniform vec2 powers;
 uniform bool leaves;   // holes to the next pass
 uniform bool cuts;   // the masks' mean is the view's alpha: those of completed views are closer to the outline than the mesh
@@ -63,7 +64,7 @@ float most = 0.0;   // sum of the weights that there would be if all were foregr
 vec4 weigh(sampler2D picture, sampler2D depth, mat4 pixel, vec3 center, vec3 lens, vec3 outward, vec3 toViewer) {
   vec3 toCamera = normalize(center - point);
   float facing = min(dot(outward, toCamera), 1.0);
-  float agreeing = min(dot(toViewer, toCamera), 1.0);
+  float agreeing = min(dot(toViewer, toCamera), 1.0) / closest;
   vec3 h = (pixel * vec4(point, 1.0)).xyz;
   if (facing <= 0.0 || agreeing <= 0.0 || h.z <= 0.0) return vec4(0.0);
   vec2 uv = h.xy / h.z;
@@ -189,7 +190,8 @@ export class Scene {
   draw(frame, viewer, eye, mode, viewport, ground) {
     const { gl } = this;
     const own = this.kept.get(frame);
-    const { blend, cameras } = /** @type {any} */ (frame.shape).header;
+    const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
+    const { blend, cameras } = shape.header;
     const { first, fill } = this.#sources(frame, eye, mode);
     const cuts = first.some((n) => cameras[n].completed);
     const matrix = clipFromWorld(viewer);
@@ -211,7 +213,8 @@ export class Scene {
     }
     passes.forEach((pass, n) => {
       const viewPower = cuts && n === 0 ? blend.completed.view_power : blend.view_power;
-      this.#pass(own, pass, { matrix, eye, blend, viewPower, hole, ground, cuts: cuts && n === 0, leaves: n + 1 < passes.length });
+      const closest = cuts && n === 0 ? nearness(shape.header, eye, first[0]) : 1;
+      this.#pass(own, pass, { matrix, eye, blend, viewPower, closest, hole, ground, cuts: cuts && n === 0, leaves: n + 1 < passes.length });
     });
     gl.disable(gl.STENCIL_TEST);
     gl.disable(gl.CULL_FACE);
@@ -224,8 +227,8 @@ export class Scene {
     this.cost = { draws: draws + Number(!hole[3]), triangles: (draws * own.count) / 3, textureBytes };
   }
 
-  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, viewPower: number, hole: number[], ground: number[], cuts: boolean, leaves: boolean}} view */
-  #pass(own, sources, { matrix, eye, blend, viewPower, hole, ground, cuts, leaves }) {
+  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, viewPower: number, closest: number, hole: number[], ground: number[], cuts: boolean, leaves: boolean}} view */
+  #pass(own, sources, { matrix, eye, blend, viewPower, closest, hole, ground, cuts, leaves }) {
     const { gl } = this;
     const { program, at } = this.#blend(sources.length);
     gl.useProgram(program);
@@ -235,6 +238,7 @@ export class Scene {
     gl.uniform1f(at.slope, blend.slope_px);
     gl.uniform1f(at.grazing, blend.grazing);
     gl.uniform1f(at.least, blend.min_weight);
+    gl.uniform1f(at.closest, closest);
     gl.uniform2f(at.powers, blend.normal_power, viewPower);
     gl.uniform3fv(at.ground, ground);
     gl.uniform1i(at.cuts, Number(cuts));
@@ -263,7 +267,7 @@ export class Scene {
     const known = this.blends.get(count);
     if (known) return known;
     const each = (/** @type {(n: number) => string[]} */ names) => Array.from({ length: count }, (_, n) => names(n)).flat();
-    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "least", "powers", "leaves", "cuts", "ground", "hole"];
+    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "least", "closest", "powers", "leaves", "cuts", "ground", "hole"];
     const perSource = each((n) => [`pixels[${n}]`, `centers[${n}]`, `lenses[${n}]`, `picture${n}`, `depth${n}`]);
     const made = buildProgram(this.gl, VERTEX, blending(count), [...uniforms, ...perSource]);
     this.blends.set(count, made);

@@ -24,10 +24,12 @@ const MOST_FAILURES = 3;
 /** Frames beyond the next that are asked for where the clock waits for late frames, and those that end the wait. */
 const [AHEAD_PATIENT, RESUMING] = [8, 4];
 
+/** The cosine between a camera and the eye, seen from the subject's centre. @param {any} header of a shape @param {number[]} eye @param {number} n the camera's number */
+export const nearness = ({ cameras, center }, eye, n) => dot(unit(sub(cameras[n].center, center)), unit(sub(eye, center)));
+
 /** All cameras' numbers by their angle to the eye, seen from the subject's centre. @param {Shape} shape @param {number[]} eye @returns {number[]} */
 export function rankedCameras({ header: { cameras, center } }, eye) {
-  const toEye = unit(sub(eye, center));
-  const near = cameras.map((/** @type {any} */ camera) => dot(unit(sub(camera.center, center)), toEye));
+  const near = cameras.map((/** @type {any} */ _, /** @type {number} */ n) => nearness({ cameras, center }, eye, n));
   return cameras.map((/** @type {any} */ _, /** @type {number} */ n) => n)
     .sort((/** @type {number} */ a, /** @type {number} */ b) => near[b] - near[a] || a - b);
 }
