@@ -12,7 +12,7 @@ CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/te
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 
-.PHONY: demo pictures test test-all tests slow shapes kernels gate pyright docs format clean
+.PHONY: demo pictures performance site test test-all tests slow shapes kernels gate pyright docs format clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
@@ -39,6 +39,12 @@ docs: .venv/installed ## the documentation site, in out/site; strict, and nothin
 
 pictures: .venv/installed ## the pictures of the README and the documents, as the package draws them now
 	$(BIN)/python research/make_pictures.py
+
+performance: .venv/installed ## the synthetic performer on the front page of the site, below 5 MB
+	$(BIN)/viewmend publish studio out/performance --max-mb 4.9 --completed-cameras 12
+
+site: performance ## the documentation site with the performance
+	$(MAKE) docs
 
 gate: .venv/installed
 	$(BIN)/ruff format --check .

@@ -11,7 +11,7 @@ from published_ball import FRAMES, publish_ball, published  # noqa: F401
 from reference.ball import BallCapture, proxy
 
 from viewmend.cli import main
-from viewmend.completed_cameras import place_around
+from viewmend.completed_cameras import place_around, with_finer_images
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.mesh import simplify, vertex_normals
 from viewmend.publishing import SCENE_BYTES
@@ -72,6 +72,14 @@ def test_completed_cameras_stand_around_or_on_the_rigs_side():
     side = place_around(CAMERAS[[0, 1, 2]], CENTER, None, 8).centers  # 60 degrees
     steps = (side[1:] - side[:-1]).norm(dim=1)
     assert float(steps.min()) > 1e-3 and float((side[-1] - side[0]).norm()) < 2.2, "there, but not back"
+
+
+def test_completed_images_are_finer_up_to_a_limit():
+    finer = with_finer_images(CAMERAS)
+    assert finer.size_px.tolist() == [[67, 67]] * 6 and finer.names == CAMERAS.names
+    large = with_finer_images(CAMERAS.resized(900, 600))
+    assert large.size_px[0].tolist() == [1024, 683]
+    assert with_finer_images(CAMERAS.resized(2000, 1000)).size_px[0].tolist() == [2000, 1000]
 
 
 def test_simplified_meshes_keep_their_shape():

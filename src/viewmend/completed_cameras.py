@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.data.source import scale_cameras
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.orbit import orbit_around
@@ -16,6 +17,11 @@ from viewmend.types import MultiViewFrame
 
 MAX_COMPLETED = 24
 """The largest number of completed virtual cameras of a frame."""
+FINER = 1.4
+"""The sides of completed images are this many times as long as those of the cameras' images, because
+drawing from an image blurs it once more."""
+MAX_FINER_PX = 1024
+"""Images are not enlarged beyond this length of their longer side, in pixels."""
 
 
 def place_around(
@@ -35,6 +41,12 @@ def place_around(
     # The path around a rig on one side swings there and back: then only its way there is used.
     swings = count > 2 and around.centers[1].allclose(around.centers[-1], atol=1e-4)
     return orbit_around(center, rig, up, count, 2 * count - 2) if swings else around
+
+
+def with_finer_images(cameras: Cameras) -> Cameras:
+    """The cameras with larger images of the same field of view (`FINER`)."""
+    scales = (max(1.0, min(FINER, MAX_FINER_PX / max(size))) for size in cameras.size_px.tolist())
+    return scale_cameras(cameras, *scales)
 
 
 def complete_views(stream: Stream, cached: CachedFrame, cameras: Cameras) -> MultiViewFrame:

@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.completed_cameras import MAX_COMPLETED, complete_views, place_around
+from viewmend.completed_cameras import MAX_COMPLETED, complete_views, place_around, with_finer_images
 from viewmend.data.source import resize_frame, scale_cameras
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import simplify, vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.assets import FrameAssets, make_assets
@@ -213,12 +214,12 @@ def publish(
     rig = first.frame.cameras.to("cpu")
     assert isinstance(first.proxy, GeometryProxy), "streams compute hulls"
     home = home_view(rig, first.proxy.center, up)
-    poses = (
-        place_around(rig, first.proxy.center, up, config.completed_cameras)
-        if config.completed_cameras
-        else None
+    poses: Cameras | None = None
+    if config.completed_cameras:
+        poses = with_finer_images(place_around(rig, first.proxy.center, up, config.completed_cameras))
+    page_bytes = _write_page(out, config.title, count > 1) + _write_poster(
+        out, stream, home, first.frame.time
     )
-    page_bytes = _write_page(out, config.title) + _write_poster(out, stream, home, first.frame.time)
     budget = SizeBudget(1e6 * config.max_mb - page_bytes - SCENE_BYTES, count)
     motion = _Motion()
     frame_bytes: list[int] = []
@@ -246,7 +247,7 @@ def publish(
     )
 
 
-def _write_page(out: Path, title: str) -> int:
+def _write_page(out: Path, title: str, moves: bool) -> int:
     """Write the page; returns its size in bytes."""
     files = page_files()
     written = 0
@@ -259,18 +260,19 @@ def _write_page(out: Path, title: str) -> int:
     modules = [
         name for name in files if name.endswith(".js") and name not in LIVE_FILES and "worker" not in name
     ]
-    page = published_html(files["index.html"].content.decode(), title, modules).encode()
+    page = published_html(files["index.html"].content.decode(), title, modules, moves).encode()
     (out / "index.html").write_bytes(page)
     return written + len(page)
 
 
-def published_html(live_html: str, title: str, modules: Sequence[str]) -> str:
+def published_html(live_html: str, title: str, modules: Sequence[str], moves: bool) -> str:
     """The page of a published performance, from the live one.
 
     Args:
         live_html: the live page.
         title: the performance's title, as text.
         modules: the scripts to load at once, by their paths.
+        moves: whether there are several frames, and hence a time line.
     """
     text = html.escape(title)
     preload = "\n".join(f'  <link rel="modulepreload" href="page/{name}">' for name in modules)
@@ -278,7 +280,8 @@ def published_html(live_html: str, title: str, modules: Sequence[str]) -> str:
   <script type="module" src="page/published.js"></script>
   <meta property="og:title" content="{text}">
   <meta property="og:image" content="poster.jpg">"""
-    poster = f"""    <img class="poster" id="poster" src="poster.jpg" alt="{text}">
+    kind = "poster" if moves else "poster still"
+    poster = f"""    <img class="{kind}" id="poster" src="poster.jpg" alt="{text}">
     <div class="labels" id="labels">"""
     says = f'document.getElementById("cover-title").textContent = "{FILE_NOTICE}"'
     file_script = f'if (location.protocol === "file:") {says};'

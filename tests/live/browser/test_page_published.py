@@ -10,7 +10,7 @@ from live.browser.conftest import SCREENSHOT_S, SIZES, View
 from published_ball import FRAMES, published  # noqa: F401
 
 FRAME = """<link rel="icon" href="data:,"><body style="margin:0">
-<iframe src="some/ball/index.html" style="width:900px;height:600px;border:0"></iframe>"""
+<iframe src="some/ball/index.html#time=0" style="width:900px;height:600px;border:0"></iframe>"""
 DRAWN = """Array.from([window, window[0] ?? window]).some(
   page => page.document.querySelector("#picture")?.dataset.drawn !== undefined)"""
 
@@ -139,6 +139,14 @@ def test_it_works_in_an_iframe(browser, host):
         page.page.wait_for_timeout(500)
         shown = page.pixels()[:600, :900]
         assert (middle_of(shown).max(-1) > 60).mean() > 0.05
+        page.page.mouse.move(450, 300)
+        page.page.mouse.wheel(0, 300)
+        page.page.wait_for_timeout(500)
+        assert np.abs(page.pixels()[:600, :900] - shown).mean() < 0.1, "the page around it keeps the wheel"
+        page.page.mouse.click(450, 300)
+        page.page.mouse.wheel(0, 300)
+        page.page.wait_for_timeout(500)
+        assert np.abs(page.pixels()[:600, :900] - shown).mean() > 0.5
 
 
 def test_a_path_becomes_a_film_without_a_server(browser, host, tmp_path):

@@ -67,6 +67,8 @@ export function listenToGestures(surface, motion, focal, wake, focus) {
   surface.addEventListener(
     "wheel",
     (event) => {
+      // In another site's page the wheel scrolls that page, until the view was touched.
+      if (window.top !== window && document.activeElement !== surface) return;
       event.preventDefault();
       motion.zoom(Math.exp(wheelPixels(event.deltaY, event.deltaMode) * (event.ctrlKey ? 0.01 : 0.0012)));
       wake();
