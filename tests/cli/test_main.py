@@ -77,6 +77,14 @@ def test_json_has_no_nan(capsys):
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.5, None], "c": {"d": [None, "x"]}}
 
 
+def test_long_work_is_announced_with_its_duration(monkeypatch, capsys):
+    now_s = iter([10.0, 40.0, 70.0, 100.0, 130.0])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(now_s))
+    assert list(console.announce_duration("abcde", "views", "--scale 0.5 is faster")) == list("abcde")
+    assert capsys.readouterr().err == "5 views will take about 2 min; --scale 0.5 is faster\n"
+    assert list(console.announce_duration([], "views")) == []
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 def test_tracking_passes_everything_on(monkeypatch, capsys, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)

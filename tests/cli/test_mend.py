@@ -13,7 +13,7 @@ from live.live_servers import wait_until
 from reference import tells_all
 from reference.ball import AwayBall, camera_at
 
-from viewmend.cli import serve
+from viewmend.cli import main, serve
 from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.native_writer import write_capture
@@ -246,3 +246,12 @@ def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend):
         code, reports[geometry], _ = mend(folder, tmp_path / geometry, *options)
         assert code == 0
     assert reports["fused"]["hull_iou"]["held"] != reports["hull"]["hull_iou"]["held"]
+
+
+def test_images_are_used_at_a_fraction_of_their_size(folder, tmp_path, mend, capsys):
+    options = ("--leave-out", "held", "--frames", "0:1")
+    code, report, _ = mend(folder, tmp_path / "half", *options, "--scale", "0.5")
+    assert code == 0 and report["psnr_whole"] > 20
+    assert cv2.imread(str(tmp_path / "half/completed/000000.png")).shape == (24, 24, 3)
+    assert main(["mend", str(folder), "--out", str(tmp_path / "none"), *options, "--scale", "1.5"]) == 2
+    assert "expected --scale above 0 and up to 1, got 1.5" in capsys.readouterr().err

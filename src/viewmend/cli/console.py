@@ -8,13 +8,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import FrameType
 from typing import TypeVar
 
 from viewmend.utils.logging import printable
 
 _Item = TypeVar("_Item")
+LONG_S = 60.0
+"""Work that takes longer than this, seconds, is announced with its duration."""
 INTERVAL_S = 30.0
 """Seconds between progress lines if standard error is not a terminal."""
 REPEATED_S = 1.0
@@ -51,6 +53,22 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         yield from bar.track(items, total, description=description)
+
+
+def announce_duration(items: Sequence[_Item], what: str, advice: str = "") -> Iterator[_Item]:
+    """Iterate over `items`, and print how long they will take, by the second one, if that is long.
+
+    `what` names the items in the message, which `advice` follows.
+    """
+    ended_s = []
+    for item in items:
+        yield item
+        ended_s.append(time.monotonic())
+        if len(ended_s) == 2:
+            left_s = (len(items) - 2) * (ended_s[1] - ended_s[0])
+            if left_s > LONG_S:
+                more = f"; {advice}" if advice else ""
+                say(f"{len(items)} {what} will take about {_duration(left_s)}{more}")
 
 
 def _duration(seconds: float) -> str:
