@@ -47,7 +47,7 @@ export function eyeCamera(view, floor, width, height) {
 export class Headset {
   /**
    * @param {import("./draw/stage.js").Stage} stage
-   * @param {{look: (eyes: any[], side: number) => void, wish: () => import("./draw/stage.js").Wish, ended: () => void}} page
+   * @param {{look: (eyes: any[], side: number) => void, drawOptions: () => import("./draw/stage.js").DrawOptions, ended: () => void}} page
    */
   constructor(stage, page) {
     this.stage = stage;
@@ -88,7 +88,7 @@ export class Headset {
     this.page.look(asked.map(({ R, T, lens: { fx, fy, cx, cy } }) => ({ R, T, fx, fy, cx, cy })), EYE_SIDE);
     views.forEach((view, eye) => {
       const { x, y, width, height } = layer.getViewport(view);
-      this.stage.draw(eyeCamera(view, floor, width, height), [x, y, width, height], { ...this.page.wish(), reproject: true }, eye);
+      this.stage.draw(eyeCamera(view, floor, width, height), [x, y, width, height], { ...this.page.drawOptions(), reproject: true }, eye);
     });
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }

@@ -8,7 +8,7 @@ import { ViewerLink } from "./link/viewer.js";
 import { openPage } from "./page.js";
 import { Film } from "./ui/film.js";
 import { MODES } from "./ui/modes.js";
-import { Place } from "./view/url_state.js";
+import { UrlState } from "./view/url_state.js";
 
 /** The server that the page came from. @returns {import("./page.js").Source} */
 function liveSource() {
@@ -29,7 +29,7 @@ function liveSource() {
     connection,
     link: new ViewerLink(connection),
     assets: new Assets(locate),
-    place: new Place("search"),
+    urlState: new UrlState("search"),
     films: {
       make: (onProgress) => new Film(token, onProgress),
       async turntable(asked) {

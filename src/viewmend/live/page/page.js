@@ -27,7 +27,7 @@ import { contained, fovOf, lensOf, resize, sharpSide, sizeFor } from "./view/len
 import { Motion } from "./view/motion.js";
 import { poseOf, poseText, timeOf } from "./view/url_state.js";
 import { extrinsicsOf, eyeOf, poseOfCamera } from "./view/pose.js";
-import { Pace, Resolution } from "./draw/resolution.js";
+import { RepaintLimiter, Resolution } from "./draw/resolution.js";
 
 /** How much closer a double-click comes. */
 const CLOSER = 0.7;
@@ -42,7 +42,7 @@ const LIMITS = { max_side_px: 2048, max_pixels: 2 ** 21 };
  * @property {any} connection its events "status" say whether the frames can be had; `open()` tries again
  * @property {any} link dispatches "rig" and "state", and takes the clock's changes; see link/viewer.js
  * @property {import("./link/assets.js").Assets} assets
- * @property {import("./view/url_state.js").Place} place writes the view to the address
+ * @property {import("./view/url_state.js").UrlState} urlState writes the view to the address
  * @property {import("./ui/paths.js").Films} films
  * @property {() => Promise<void>} start
  */
@@ -57,7 +57,7 @@ export class Page {
     this.stage = new Stage(this.canvas);
     this.motion = new Motion(window.matchMedia("(prefers-reduced-motion: reduce)").matches);
     this.resolution = new Resolution();
-    this.pace = new Pace(this.stage.software);
+    this.repaints = new RepaintLimiter(this.stage.software);
     this.limits = LIMITS;
     this.painted = 0;
     this.scheduled = false;
@@ -74,7 +74,7 @@ export class Page {
     this.refining = new Refining();
     this.statistics = new Statistics(() => this.motion.moving || (this.transport.playing && this.transport.shown >= 0));
     this.transport = new Transport(this.link, timeOf(query.get("time")));
-    this.place = source.place;
+    this.urlState = source.urlState;
     this.motion.first = poseOf(query.get("pose"));
     this.layout = new Layout(this.settings, () => this.wake());
     this.cameras = new CameraList(this.settings, (camera) => this.snap(camera));
@@ -86,7 +86,7 @@ export class Page {
     this.snapped = null;
     this.headset = new Headset(this.stage, {
       look: (eyes, side) => this.link.look({ ...this.wanted(), eyes, width: side, height: side, depth: true, moving: false }),
-      wish: () => this.wish(0.5),
+      drawOptions: () => this.drawOptions(0.5),
       ended: () => this.wake(),
     });
     const { motion, transport, notices, settings } = this;
@@ -99,8 +99,8 @@ export class Page {
       reset: () => this.reset(),
       shot: () => screenshot(this.canvas, () => this.paint(), `viewmend-${String(transport.shown).padStart(4, "0")}.png`, notices),
       link: () => {
-        this.tell();
-        return this.place.link();
+        this.updateAddress();
+        return this.urlState.link();
       },
       headset: () => this.headset.enter(motion.rig, motion.pose),
     });
@@ -317,7 +317,7 @@ export class Page {
   ask() {
     if (!this.motion.pose || this.headset.session) return;
     if (!this.source.live) {
-      if (!this.motion.moving) this.tell();
+      if (!this.motion.moving) this.updateAddress();
       return;
     }
     const { drawing } = this;
@@ -339,14 +339,14 @@ export class Page {
       if (!drawing) this.notices.asked();
       if (!moving && !this.transport.playing) this.refining.begin();
     }
-    if (!moving) this.tell();
+    if (!moving) this.updateAddress();
   }
 
-  /** Say in the address what is shown. */
-  tell() {
+  /** Write what is shown to the address. */
+  updateAddress() {
     const { motion, settings, transport } = this;
     const split = settings.get("mode") === "split";
-    this.place.update({
+    this.urlState.update({
       pose: motion.atHome || !motion.goal ? null : poseText(motion.goal),
       time: transport.still < 0 ? null : String(transport.still),
       mode: settings.get("mode") === "completed" ? null : settings.get("mode"),
@@ -356,8 +356,8 @@ export class Page {
     });
   }
 
-  /** @param {number} divider its place as a share of the viewport's width @returns {import("./draw/stage.js").Wish} */
-  wish(divider) {
+  /** @param {number} divider its place as a share of the viewport's width @returns {import("./draw/stage.js").DrawOptions} */
+  drawOptions(divider) {
     const { settings } = this;
     const split = settings.get("mode") === "split";
     const parts = split
@@ -378,7 +378,7 @@ export class Page {
     const divider = Math.min(1, Math.max(0, (x - box.left) / box.width));
     const viewport = [box.left, height - box.top - box.height, box.width, box.height].map((value) => Math.round(value * ratio));
     this.stage.clear(this.settings.ground);
-    this.stage.draw(viewer, viewport, this.wish(divider));
+    this.stage.draw(viewer, viewport, this.drawOptions(divider));
     nameSides(this.settings, (mode) => this.stage.shownMode(viewer, mode));
     this.cameras.place(this.settings.get("rig"), viewer, box);
     this.compare();
@@ -411,7 +411,7 @@ export class Page {
   /** @param {number} now */
   refresh(now) {
     this.scheduled = false;
-    if (!this.pace.due(now)) {
+    if (!this.repaints.due(now)) {
       this.wake(false);
       return;
     }

@@ -5,7 +5,7 @@ import { openPage } from "./page.js";
 import { CanvasFilm } from "./published/film.js";
 import { Recording } from "./published/recording.js";
 import { byId } from "./ui/dom.js";
-import { Place } from "./view/url_state.js";
+import { UrlState } from "./view/url_state.js";
 
 const MODES = ["rendered", "holes", "completed", "split"];
 
@@ -32,7 +32,7 @@ function publishedSource() {
     connection: recording,
     link: recording,
     assets,
-    place: new Place("hash"),
+    urlState: new UrlState("hash"),
     films: {
       make: (onProgress) => new CanvasFilm(locate, () => recording.scene, onProgress),
       turntable: async (asked) => recording.frame(asked),

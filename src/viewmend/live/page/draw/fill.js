@@ -34,8 +34,8 @@ void main() {
     }
   } else discard;
   seen += vec4(own.rgb, 1.0) * ${OWN.toFixed(2)};
-  float most = ${MOST_EMPTY.toFixed(1)} * seen.a;
-  vec4 sum = seen + vec4(ground, 1.0) * (empty * most / (empty + most));
+  float maxEmpty = ${MOST_EMPTY.toFixed(1)} * seen.a;
+  vec4 sum = seen + vec4(ground, 1.0) * (empty * maxEmpty / (empty + maxEmpty));
   colour = vec4(sum.rgb / sum.a, 1.0);
 }`;
 

@@ -61,8 +61,8 @@ export function samePlace(source, width, height, viewer) {
   const { lens } = viewer;
   const [x, y] = [width / lens.width, height / lens.height];
   const K = [lens.fx * x, 0, lens.cx * x, 0, lens.fy * y, lens.cy * y];
-  const most = (/** @type {number[]} */ a, /** @type {number[]} */ b) => Math.max(...a.map((value, i) => Math.abs(value - b[i])));
-  return most(K, source.K) < 0.05 && most(viewer.R, source.R) < 1e-4 && most(viewer.T, source.T) < 1e-4;
+  const largestDifference = (/** @type {number[]} */ a, /** @type {number[]} */ b) => Math.max(...a.map((value, i) => Math.abs(value - b[i])));
+  return largestDifference(K, source.K) < 0.05 && largestDifference(viewer.R, source.R) < 1e-4 && largestDifference(viewer.T, source.T) < 1e-4;
 }
 
 /** How far a vertex may be from where the surface is looked for, pixels. */

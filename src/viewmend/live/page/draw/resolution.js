@@ -33,15 +33,15 @@ export class Resolution {
 /** Mean time between repaints where there is no GPU: each takes the processor that pictures are decoded with, too. */
 const SOFTWARE_MS = 25;
 
-/** Leaves out some of the display's refreshes. */
-export class Pace {
+/** Skips some of the display's refreshes, so that repaints have a minimum distance in time. */
+export class RepaintLimiter {
   /** @param {boolean} software whether the processor draws */
   constructor(software) {
     this.gap = software ? SOFTWARE_MS : 0;
     this.next = -Infinity;
   }
 
-  /** @param {number} now of a refresh, ms @returns {boolean} whether to paint at this one */
+  /** @param {number} now time of a refresh, ms @returns {boolean} whether to repaint */
   due(now) {
     if (now < this.next - 1) return false;
     this.next = Math.max(now, this.next + this.gap);

@@ -47,10 +47,10 @@ centroid in vec3 normal;
 centroid in vec3 tint;
 out vec4 colour;
 uniform vec3 eye;
-uniform float bias, slope, grazing, least;
+uniform float bias, slope, grazing, minWeight;
 uniform float closest;   // cosine between the directions to the viewer and to the closest camera; 1 where weights are absolute
 uniform vec2 powers;
-uniform bool leaves;   // holes to the next pass
+uniform bool leaveHoles;   // holes to the next pass
 uniform bool cuts;   // the masks' mean is the view's alpha: those of completed views are closer to the outline than the mesh
 uniform vec3 ground;   // colour of the background
 uniform vec4 hole;    // colour of holes; that of the vertices where its alpha is 0, which then stays 0
@@ -104,9 +104,9 @@ ${Array.from(
   (_, n) => `  sum += weigh(picture${n}, depth${n}, pixels[${n}], centers[${n}], lenses[${n}], outward, toViewer);`,
 ).join("\n")}
   float known = cuts ? most : sum.a;
-  if (leaves && known < least) discard;
+  if (leaveHoles && known < minWeight) discard;
   vec3 seen = sum.rgb / max(sum.a, 1e-6);
-  if (known < least) colour = vec4(mix(tint, hole.rgb, hole.a), hole.a);
+  if (known < minWeight) colour = vec4(mix(tint, hole.rgb, hole.a), hole.a);
   else colour = vec4(cuts ? mix(ground, seen, min(1.0, sum.a / most)) : seen, 1.0);
 }`;
 
@@ -214,7 +214,7 @@ export class Scene {
     passes.forEach((pass, n) => {
       const viewPower = cuts && n === 0 ? blend.completed.view_power : blend.view_power;
       const closest = cuts && n === 0 ? nearness(shape.header, eye, first[0]) : 1;
-      this.#pass(own, pass, { matrix, eye, blend, viewPower, closest, hole, ground, cuts: cuts && n === 0, leaves: n + 1 < passes.length });
+      this.#pass(own, pass, { matrix, eye, blend, viewPower, closest, hole, ground, cuts: cuts && n === 0, leaveHoles: n + 1 < passes.length });
     });
     gl.disable(gl.STENCIL_TEST);
     gl.disable(gl.CULL_FACE);
@@ -227,8 +227,8 @@ export class Scene {
     this.cost = { draws: draws + Number(!hole[3]), triangles: (draws * own.count) / 3, textureBytes };
   }
 
-  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, viewPower: number, closest: number, hole: number[], ground: number[], cuts: boolean, leaves: boolean}} view */
-  #pass(own, sources, { matrix, eye, blend, viewPower, closest, hole, ground, cuts, leaves }) {
+  /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, viewPower: number, closest: number, hole: number[], ground: number[], cuts: boolean, leaveHoles: boolean}} view */
+  #pass(own, sources, { matrix, eye, blend, viewPower, closest, hole, ground, cuts, leaveHoles }) {
     const { gl } = this;
     const { program, at } = this.#blend(sources.length);
     gl.useProgram(program);
@@ -237,12 +237,12 @@ export class Scene {
     gl.uniform1f(at.bias, blend.bias_m);
     gl.uniform1f(at.slope, blend.slope_px);
     gl.uniform1f(at.grazing, blend.grazing);
-    gl.uniform1f(at.least, blend.min_weight);
+    gl.uniform1f(at.minWeight, blend.min_weight);
     gl.uniform1f(at.closest, closest);
     gl.uniform2f(at.powers, blend.normal_power, viewPower);
     gl.uniform3fv(at.ground, ground);
     gl.uniform1i(at.cuts, Number(cuts));
-    gl.uniform1i(at.leaves, Number(leaves));
+    gl.uniform1i(at.leaveHoles, Number(leaveHoles));
     gl.uniform4fv(at.hole, hole);
     sources.forEach((source, n) => {
       gl.uniformMatrix4fv(at[`pixels[${n}]`], false, source.pixels);
@@ -267,7 +267,7 @@ export class Scene {
     const known = this.blends.get(count);
     if (known) return known;
     const each = (/** @type {(n: number) => string[]} */ names) => Array.from({ length: count }, (_, n) => names(n)).flat();
-    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "least", "closest", "powers", "leaves", "cuts", "ground", "hole"];
+    const uniforms = ["clip", "eye", "bias", "slope", "grazing", "minWeight", "closest", "powers", "leaveHoles", "cuts", "ground", "hole"];
     const perSource = each((n) => [`pixels[${n}]`, `centers[${n}]`, `lenses[${n}]`, `picture${n}`, `depth${n}`]);
     const made = buildProgram(this.gl, VERTEX, blending(count), [...uniforms, ...perSource]);
     this.blends.set(count, made);

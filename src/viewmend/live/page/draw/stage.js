@@ -20,7 +20,7 @@ import { eyeOfCamera } from "../view/pose.js";
  */
 
 /**
- * @typedef {object} Wish
+ * @typedef {object} DrawOptions what to draw
  * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the viewport's width
  * @property {boolean} reproject
  * @property {any} rig the cameras to show; null to show none
@@ -145,12 +145,12 @@ export class Stage {
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
-  /** Draw into a part of the current framebuffer, which it clears. @param {Viewpoint} viewer @param {number[]} viewport x, y, width, height in pixels, y up @param {Wish} wish @param {number} [eye] */
-  draw(viewer, viewport, wish, eye = 0) {
+  /** Draw into a part of the current framebuffer, which it clears. @param {Viewpoint} viewer @param {number[]} viewport x, y, width, height in pixels, y up @param {DrawOptions} options @param {number} [eye] */
+  draw(viewer, viewport, options, eye = 0) {
     const { gl } = this;
     const [x, y, width, height] = viewport;
-    if (wish.frame) {
-      this.#scene(viewer, viewport, wish, wish.frame, eye);
+    if (options.frame) {
+      this.#scene(viewer, viewport, options, options.frame, eye);
       return;
     }
     gl.viewport(x, y, width, height);
@@ -162,25 +162,25 @@ export class Stage {
     const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
     if (this.header && kept) {
       let start = 0;
-      for (const { mode, until } of wish.parts) {
+      for (const { mode, until } of options.parts) {
         const [from, to] = [Math.round(start * width), Math.round(until * width)];
         gl.scissor(x + from, y, Math.max(0, to - from), height);
         const shown = this.shownMode(viewer, mode);
         if (shown in this.photos) this.#photo(viewer, shown);
-        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(shown) ? shown : kept.modes[0]], wish, eye);
+        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(shown) ? shown : kept.modes[0]], options, eye);
         start = until;
       }
       gl.scissor(x, y, width, height);
     }
-    if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
+    if (options.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
   }
 
-  /** The frame as drawn here, and over it the server's picture of the same view. @param {Viewpoint} viewer @param {number[]} viewport @param {Wish} wish @param {import("../link/assets.js").Frame} frame @param {number} eye */
-  #scene(viewer, [x, y, width, height], wish, frame, eye) {
+  /** The frame as drawn here, and over it the server's picture of the same view. @param {Viewpoint} viewer @param {number[]} viewport @param {DrawOptions} options @param {import("../link/assets.js").Frame} frame @param {number} eye */
+  #scene(viewer, [x, y, width, height], options, frame, eye) {
     const { gl, header } = this;
     const place = eyeOfCamera(viewer);
-    this.scene.prepare(frame, place, wish.parts.map(({ mode }) => this.shownMode(viewer, mode)));
-    const cutOuts = wish.rig ? this.scene.cutOuts(frame) : [];
+    this.scene.prepare(frame, place, options.parts.map(({ mode }) => this.shownMode(viewer, mode)));
+    const cutOuts = options.rig ? this.scene.cutOuts(frame) : [];
     const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
     const source = header?.cameras[Math.min(eye, header.cameras.length - 1)];
     const same = header && kept && header.time === frame.time && samePlace(source, header.width, header.height, viewer);
@@ -193,7 +193,7 @@ export class Stage {
     gl.scissor(x, y, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     let start = 0;
-    for (const { mode: wanted, until } of wish.parts) {
+    for (const { mode: wanted, until } of options.parts) {
       const mode = this.shownMode(viewer, wanted);
       const [from, to] = [Math.round(start * width), Math.round(until * width)];
       gl.scissor(x + from, y, Math.max(0, to - from), height);
@@ -203,13 +203,13 @@ export class Stage {
         this.#photo(viewer, mode);
         continue;
       }
-      if (over < 1 || wish.rig) this.scene.draw(frame, viewer, place, mode, [x, y, width, height], this.ground);
+      if (over < 1 || options.rig) this.scene.draw(frame, viewer, place, mode, [x, y, width, height], this.ground);
       if (over > 0) this.#overlay(kept, kept.textures[mode], over);
     }
     gl.scissor(x, y, width, height);
-    if (!wish.rig) return;
+    if (!options.rig) return;
     for (const { camera, picture } of cutOuts) {
-      const depth = pyramidDepth(camera, wish.rig.center);
+      const depth = pyramidDepth(camera, options.rig.center);
       if (length(sub(place, camera.center)) < 1.5 * depth) continue; // it would hide the view
       this.quad = upload(gl, this.quad, planeOf(camera.width, camera.height, depth));
       this.#image(camera, picture, this.quad, clipFromPicture(camera, viewer));
@@ -264,13 +264,13 @@ export class Stage {
     gl.enable(gl.DEPTH_TEST);
   }
 
-  /** @param {Viewpoint} viewer @param {any} kept @param {WebGLTexture} picture @param {Wish} wish @param {number} eye */
-  #picture(viewer, kept, picture, wish, eye) {
+  /** @param {Viewpoint} viewer @param {any} kept @param {WebGLTexture} picture @param {DrawOptions} options @param {number} eye */
+  #picture(viewer, kept, picture, options, eye) {
     const { gl } = this;
     const header = /** @type {Header} */ (this.header);
     const { program, at } = /** @type {any} */ (this.painter);
     const source = header.cameras[Math.min(eye, header.cameras.length - 1)];
-    const still = !wish.reproject || samePlace(source, header.width, header.height, viewer);
+    const still = !options.reproject || samePlace(source, header.width, header.height, viewer);
     gl.useProgram(program);
     gl.bindTexture(gl.TEXTURE_2D, picture);
     gl.uniform2f(at.size, header.width, header.height);
@@ -281,7 +281,7 @@ export class Stage {
       gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
       gl.bindVertexArray(kept.quad.array);
       gl.drawElements(gl.TRIANGLES, kept.quad.solid, gl.UNSIGNED_INT, 0);
-      if (!wish.rig || !kept.mesh) return;
+      if (!options.rig || !kept.mesh) return;
       gl.colorMask(false, false, false, false);
     }
     const mesh = kept.mesh ?? kept.quad;

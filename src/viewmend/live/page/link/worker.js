@@ -1,4 +1,4 @@
-// The socket, and what comes through it made ready to be drawn. In a thread of its own: on the page's, every step of a
+// The socket, and the decoders of its messages. They run in a thread of their own: on the page's thread, every step of a
 // decoder would wait for a repaint.
 
 import { decodeDepth, parseFrame } from "./frames.js";
@@ -18,7 +18,7 @@ let decoder = new PictureDecoder();
 let queue = Promise.resolve();
 
 /** @param {News} news @param {Transferable[]} [transfer] */
-const tell = (news, transfer = []) => postMessage(news, /** @type {any} */ (transfer));
+const post = (news, transfer = []) => postMessage(news, /** @type {any} */ (transfer));
 
 /** @param {string} url */
 function open(url) {
@@ -28,16 +28,16 @@ function open(url) {
   socket = own;
   decoder.close();
   decoder = new PictureDecoder();
-  own.onopen = () => tell({ opened: true });
+  own.onopen = () => post({ opened: true });
   own.onmessage = ({ data }) => {
     if (socket !== own) return;
-    if (typeof data === "string") tell({ text: data });
+    if (typeof data === "string") post({ text: data });
     else take(own, data);
   };
   own.onclose = ({ code, reason }) => {
     if (socket !== own) return;
     socket = null;
-    tell({ closed: { code, reason } });
+    post({ closed: { code, reason } });
   };
 }
 
@@ -50,10 +50,10 @@ function take(from, message) {
   queue = queue
     .then(async () => {
       const { eyes, transfer } = await decoded;
-      tell({ picture: { header: frame.header, eyes, bytes: frame.bytes } }, transfer);
+      post({ picture: { header: frame.header, eyes, bytes: frame.bytes } }, transfer);
     })
     .catch((error) => {
-      if (socket === from) tell({ trouble: String(error.message ?? error) });
+      if (socket === from) post({ trouble: String(error.message ?? error) });
     });
 }
 

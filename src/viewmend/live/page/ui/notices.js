@@ -13,7 +13,7 @@ export class Notices {
     /** @type {any} */
     this.state = null;
     this.pictured = false;
-    this.untold = false;
+    this.lacksConfidence = false;
     this.waitingSince = 0;
     byId("cover-retry").addEventListener("click", retry);
     setInterval(() => this.show(), 500);
@@ -37,12 +37,12 @@ export class Notices {
     this.waitingSince ||= performance.now();
   }
 
-  /** It is there. @param {boolean} untold whether it ought to show a confidence that the model does not tell */
-  arrived(untold) {
+  /** A picture has arrived. @param {boolean} lacksConfidence whether its mode shows confidence, which the model does not predict */
+  arrived(lacksConfidence) {
     this.waitingSince = 0;
-    if (this.pictured && this.untold === untold) return;
+    if (this.pictured && this.lacksConfidence === lacksConfidence) return;
     this.pictured = true;
-    this.untold = untold;
+    this.lacksConfidence = lacksConfidence;
     this.show();
   }
 
@@ -91,7 +91,7 @@ export class Notices {
       return { kind: this.pictured ? "warning" : "error", title: "Source error", text: reason };
     }
     if (this.state.model_error) return { kind: "warning", title: "Model failed; showing the rendered view", text: this.state.model_error };
-    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model has no confidence map. Start the server with --model views to see one." };
+    if (this.lacksConfidence) return { kind: "warning", title: "No confidence", text: "This model has no confidence map. Start the server with --model views to see one." };
     if (!this.pictured) return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     const late = this.waitingSince && performance.now() - this.waitingSince > STALLED_MS;
     if (late || this.state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };

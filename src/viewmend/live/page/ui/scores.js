@@ -9,10 +9,10 @@ const WAIT_MS = 300;
 /** @typedef {{model: string | null, psnr: number, blob: Blob}} Score */
 
 export class Scores {
-  /** @param {string | null} token @param {(asked: Asked | null, score: Score | null) => void} tell called with each score, and with null when none holds any more */
-  constructor(token, tell) {
+  /** @param {string | null} token @param {(asked: Asked | null, score: Score | null) => void} report called with each score, and with null when none holds any more */
+  constructor(token, report) {
     this.token = token;
-    this.tell = tell;
+    this.report = report;
     this.key = "null";
     this.timer = 0;
     this.stopped = new AbortController();
@@ -25,7 +25,7 @@ export class Scores {
     this.key = key;
     clearTimeout(this.timer);
     this.stopped.abort();
-    this.tell(null, null);
+    this.report(null, null);
     if (asked) this.timer = window.setTimeout(() => void this.#ask(asked), WAIT_MS);
   }
 
@@ -40,7 +40,7 @@ export class Scores {
       const answer = await fetch(url, { signal }).catch(() => null);
       const psnr = Number(answer?.headers.get("X-Viewmend-PSNR"));
       const blob = await answer?.blob().catch(() => null);
-      if (answer?.ok && blob && !signal.aborted) this.tell(asked, { model, psnr, blob });
+      if (answer?.ok && blob && !signal.aborted) this.report(asked, { model, psnr, blob });
     }
   }
 }

@@ -61,7 +61,7 @@ export class Transport {
   toggle() {
     this.sought = -1;
     const playing = !this.#current("playing", true);
-    this.#tell(playing || !this.drawing || this.shown < 0 ? { playing } : { playing, seek: this.shown });
+    this.#sendClock(playing || !this.drawing || this.shown < 0 ? { playing } : { playing, seek: this.shown });
   }
 
   /** The frames that there are. */
@@ -97,13 +97,13 @@ export class Transport {
   seek(time) {
     if (time === this.sought && this.seeking) return;
     this.sought = time;
-    this.#tell({ seek: time });
+    this.#sendClock({ seek: time });
   }
 
   /** @param {number} time */
   pauseAt(time) {
     this.sought = time;
-    this.#tell({ playing: false, seek: time });
+    this.#sendClock({ playing: false, seek: time });
   }
 
   /** @param {number} frames */
@@ -115,12 +115,12 @@ export class Transport {
 
   live() {
     this.sought = -1;
-    this.#tell({ live: true, speed: 1 });
+    this.#sendClock({ live: true, speed: 1 });
   }
 
   /** @param {number} speed */
   speed(speed) {
-    this.#tell({ speed });
+    this.#sendClock({ speed });
   }
 
   /** @param {number} steps along the list of speeds */
@@ -136,8 +136,8 @@ export class Transport {
     return requested && performance.now() - requested.at < HEARD_MS ? requested.value : (this.state?.[name] ?? otherwise);
   }
 
-  /** @param {any} clock */
-  #tell(clock) {
+  /** Send a change of the clock, and show it before the server confirms it. @param {any} clock */
+  #sendClock(clock) {
     this.link.clock(clock);
     const parted = clock.seek !== undefined || (clock.speed ?? 1) !== 1 || clock.playing === false;
     const meant = { ...clock, ...(clock.live ? { playing: true } : parted ? { live: false } : {}) };
@@ -158,7 +158,7 @@ export class Transport {
     if (this.first >= 0 && state.end > Math.min(this.first, (state.total ?? Infinity) - 1)) {
       const seek = this.first;
       this.first = -1;
-      this.#tell({ playing: false, seek });
+      this.#sendClock({ playing: false, seek });
       return;
     }
     byId("transport").hidden = recording && state.total === 1; // a single frame

@@ -25,7 +25,7 @@ export function poseOf(text) {
 export const timeOf = (text) => (/^\d{1,9}$/.test(text ?? "") ? Number(text) : -1);
 
 /** Writes the view to the URL once it rests. */
-export class Place {
+export class UrlState {
   /** @param {"search" | "hash"} part of the URL that holds it */
   constructor(part) {
     this.part = part;
