@@ -6,6 +6,8 @@ CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-c
 # Static checks, documents and tests run next to each other.
 MAKEFLAGS += --jobs=4
 PYTEST := $(BIN)/pytest -n auto --dist worksteal
+# Without the checks: JAXTYPING_DISABLE alone would still wrap every function.
+UNCHECKED := JAXTYPING_DISABLE=1 $(PYTEST) --jaxtyping-packages=
 # Array shapes are checked in every call: by `make test` in these tests, by `make test-all` in all of them.
 CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/test_cameras.py \
 	tests/rendering/test_view.py tests/models/test_attention.py tests/data/test_prepare.py \
@@ -23,10 +25,10 @@ test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays
 	$(PYTEST) -m ""
 
 tests: kernels
-	JAXTYPING_DISABLE=1 $(PYTEST)
+	$(UNCHECKED)
 
 slow: kernels ## tests over ten seconds, and those in a browser
-	JAXTYPING_DISABLE=1 $(PYTEST) -m slow
+	$(UNCHECKED) -m slow
 
 shapes: kernels
 	$(BIN)/pytest $(CHECKED)

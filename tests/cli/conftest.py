@@ -6,10 +6,17 @@ import shutil
 import pytest
 from reference.ball import BallCapture, camera_at
 from reference.capture_folder import edit_description
+from reference.computed_once import compute_once
 
 from viewmend.cli import main
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
+
+
+@pytest.fixture(autouse=True)
+def _computed_once(monkeypatch):
+    """Checks of a capture and people of the studio are computed once, not in each test."""
+    compute_once(monkeypatch)
 
 
 def rig():

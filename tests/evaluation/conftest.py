@@ -3,6 +3,7 @@
 from dataclasses import fields
 
 import pytest
+from reference.computed_once import compute_once
 
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import Cell, CellKey
@@ -12,6 +13,12 @@ from viewmend.studio.stage import StudioConfig
 
 ORIGIN_PX = ("sources_px", "others_px", "past_px", "only_past_px")
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)
+
+
+@pytest.fixture(autouse=True)
+def _computed_once(monkeypatch):
+    """Checks of a capture and people of the studio are computed once, not in each test."""
+    compute_once(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from reference.computed_once import compute_once
 
 from viewmend.models.paper.config import paper_small
 from viewmend.models.views.config import ViewsConfig
@@ -28,6 +29,12 @@ RUN: dict[str, Any] = {
     **{"steps": 4, "batch": 2, "new_per_batch": 1, "replay_size": 3, "warmup": 1, "workers": 0, "ema": 0.5},
     **{"precision": "float32", "checkpoint_minutes": 1e9, "validate_every": 0, "validation_views": 2},
 }
+
+
+@pytest.fixture(autouse=True)
+def _computed_once(monkeypatch):
+    """Checks of a capture and people of the studio are computed once, not in each test."""
+    compute_once(monkeypatch)
 
 
 def studio_samples(seed: str = "0", scenes: SceneConfig = SCENES, **sampling: Any) -> SampleScenes:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from viewmend.data.capture_folder import CaptureFolder
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_image
-from viewmend.data.prepare import first_with_subject, open_masked, prepare
+from viewmend.data.prepare import PreparedCapture, first_with_subject, open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.frame_cache import CachedFrame
 from viewmend.metrics.image_quality import psnr
@@ -215,9 +215,11 @@ def _views_of(capture: CaptureFolder, own: HeldBack, table: bool) -> Iterator[He
     else:
         times = [count * n // MAX_VIEWS for n in range(1, MAX_VIEWS)] if count > MAX_VIEWS else range(count)
         wanted = [(own.camera, time) for time in (*times, late[-1])]
+    without: dict[str, PreparedCapture] = {}
     for camera, time in dict.fromkeys(wanted):
-        others = tuple(name for name in names if name != camera)
-        prepared = prepare(capture, others)
+        if camera not in without:
+            without[camera] = prepare(capture, tuple(name for name in names if name != camera))
+        prepared = without[camera]
         frame = prepared.read(time)
         if camera not in frame.cameras.names or len(frame.cameras) < 3:
             continue

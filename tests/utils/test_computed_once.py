@@ -1,0 +1,16 @@
+"""What tests compute once is computed again for other content."""
+
+import torch
+from reference.computed_once import computed_once
+
+
+def test_results_are_kept_for_equal_content_only():
+    given = []
+    add = computed_once(lambda values, more: given.append(values.clone()) or float(values.sum()) + more)
+    values = torch.ones(2)
+    assert add(values, 1) == add(values.clone(), 1) == 3
+    assert len(given) == 1
+    values[0] = 5
+    assert add(values, 1) == 7, "changed in place"
+    assert add(values, 2) == 8
+    assert len(given) == 3
