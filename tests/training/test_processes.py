@@ -18,7 +18,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from conftest import MODEL, RUN, SAMPLING, SCENES
+from training.conftest import MODEL, RUN, SAMPLING, SCENES
 from viewmend.training.config import TrainConfig
 from viewmend.training.loop import train
 from viewmend.training.paper import PaperObjectiveConfig
@@ -43,9 +43,9 @@ TORCHRUN = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone")
 def started(out, steps, shards, streams=1, launcher=(), text=SCRIPT):
     script = out.with_suffix(".py")
     script.write_text(text)
-    here = str(Path(__file__).parent)
+    tests = str(Path(__file__).parents[1])
     environment = os.environ | {"OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
-    command = [sys.executable, *launcher, str(script), here, str(out), str(steps), str(streams), str(shards)]
+    command = [sys.executable, *launcher, str(script), tests, str(out), str(steps), str(streams), str(shards)]
     with out.with_suffix(".log").open("w") as log:
         return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
