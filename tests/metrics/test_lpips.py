@@ -41,6 +41,8 @@ def agrees_with_the_twin(metric, image, truth):
     least = MIN_PX[metric.backbone]
     assert metric.map(torch.zeros(3, least - 1, 99), torch.zeros(3, least - 1, 99)) is None
     assert metric.map(torch.zeros(3, least, 99), torch.zeros(3, least, 99)) is not None
+    smallest = torch.zeros(1, 3, least, 99)
+    assert float(metric(smallest, smallest)) == 0
     with pytest.raises(ValueError, match=f"at least {least} pixels a side .* got 99 x {least - 1}"):
         metric(torch.zeros(1, 3, least - 1, 99), torch.zeros(1, 3, least - 1, 99))
 
