@@ -51,6 +51,7 @@ from viewmend.models.views.prediction import (
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
 from viewmend.models.views.sampler import Rays, RaySamples, RayStatistics, choose_cameras, sample_rays
+from viewmend.models.views.steadying import steady
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
@@ -256,7 +257,7 @@ class ViewSynthNet(Network):
         """Predicts all of E on the proxy and its rim, or attenuates it where `view.fade` says so.
 
         With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from
-        their surroundings.
+        their surroundings. What is predicted is steadied by the viewer's last view, its state.
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
@@ -277,7 +278,8 @@ class ViewSynthNet(Network):
         ray_fill = guess if not quick and self.coarse is not None else None
         prediction = self(view, sources, where=where, guess=guess)
         completed = prediction.composite_into(view, where, fades, ray_fill)
-        return opaque_in_mask(completed), state
+        completed, last = steady(completed, where, state)
+        return opaque_in_mask(completed), last
 
     def _depth_distribution(
         self,

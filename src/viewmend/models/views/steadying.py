@@ -1,0 +1,120 @@
+"""Steadies films: the last view of a viewer, moved along with the subject, holds back what changes without reason.
+
+Every frame is predicted on its own, so that outlines, colours and small pieces flicker where cameras
+are few. Dense optical flow (DIS; Kroeger et al., ECCV 2016) aligns the last completed view with the
+new one. Their difference is split into means over small squares and the detail around these. A part
+of each is taken back where it is small: large differences are real changes, or errors of the flow.
+Detail is held to a much smaller difference, so that it stays as sharp as it was predicted.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras
+from viewmend.models.base import State
+from viewmend.types import CompletedView
+
+Channels = Float32[np.ndarray, "height width 4"]
+"""RGB on black, and alpha."""
+
+
+@dataclass(frozen=True)
+class SteadyingRule:
+    """How much of a difference between aligned views is taken back."""
+
+    weight: float
+    """The largest share that is taken back."""
+    similar: float
+    """The share falls to 1/e of it at this difference, in [0, 1]."""
+
+
+MEANS = SteadyingRule(weight=0.7, similar=0.2)
+DETAIL = SteadyingRule(weight=0.5, similar=0.05)
+MEAN_PX = 5
+"""The means are over squares of this side, pixels."""
+MAX_GAP = 3
+"""The last view is used if it is at most this many frames older."""
+MAX_TURN_DEG = 8.0
+"""The last view is used if the camera has turned by less than this angle, degrees."""
+MAX_ZOOM = 0.1
+"""The last view is used if the focal length has changed by less than this share."""
+
+
+@dataclass(frozen=True)
+class LastView(State):
+    """The last completed view of a viewer, or the part of it that shows the subject."""
+
+    image: Float[Tensor, "4 height width"]
+    """RGB on black, and alpha."""
+    camera: Cameras
+    time: int
+    """Index of its frame."""
+
+    def precedes(self, camera: Cameras, time: int) -> bool:
+        """Whether a view of this camera at the frame `time` shows almost the same, a little later."""
+        if not 0 < time - self.time <= MAX_GAP:
+            return False
+        before = self.camera.on_host
+        now = camera.on_host
+        cosine = float(before.world_from_camera[0, :3, 2] @ now.world_from_camera[0, :3, 2])
+        zoom = float(now.K[0, 0, 0] / before.K[0, 0, 0])
+        return cosine > math.cos(math.radians(MAX_TURN_DEG)) and abs(zoom - 1) < MAX_ZOOM
+
+    def placed_in(self, camera: Cameras) -> Channels:
+        """The image with its principal point where `camera` has it: both may be crops of larger views."""
+        width, height = camera.max_size_px
+        shift_px = (camera.on_host.K - self.camera.on_host.K)[0, :2, 2].double().numpy()
+        matrix = np.hstack([np.eye(2), shift_px[:, None]])
+        return np.asarray(cv2.warpAffine(_channels(self.image), matrix, (width, height)))
+
+
+def steady(
+    completed: CompletedView, predicted: Bool[Tensor, "height width"], last: State
+) -> tuple[CompletedView, LastView]:
+    """A view whose predicted pixels are steadied by the viewer's last view, and the viewer's next state.
+
+    Without a last view, or if it shows something else (`LastView.precedes`), the view is unchanged.
+    """
+    view = completed.view
+    assert completed.alpha is not None, "the model predicts alpha"
+    image = torch.cat([completed.rgb, completed.alpha[None]])
+    if isinstance(last, LastView) and last.precedes(view.camera, view.time):
+        change = steadying_change(_channels(image), last.placed_in(view.camera))
+        weight = view.error * predicted
+        image = (image + weight * torch.from_numpy(change).to(image).permute(2, 0, 1)).clamp(0, 1)
+        completed = replace(completed, rgb=image[:3], alpha=image[3])
+    return completed, LastView(image, view.camera, view.time)
+
+
+def steadying_change(now: Channels, before: Channels) -> Channels:
+    """What is added to a view, given the last one in the same image coordinates."""
+    height, width = now.shape[:2]
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow_px = np.asarray(search.calc(_grey(now), _grey(before), None), np.float32)
+    x_px = np.arange(width, dtype=np.float32) + flow_px[..., 0]
+    y_px = np.arange(height, dtype=np.float32)[:, None] + flow_px[..., 1]
+    moved = np.asarray(cv2.remap(before, x_px, y_px, cv2.INTER_CUBIC)).clip(0, 1)
+
+    difference = moved - now
+    means = np.asarray(cv2.blur(difference, (MEAN_PX, MEAN_PX)))
+    return _part(means, MEANS) + _part(difference - means, DETAIL)
+
+
+def _part(difference: Channels, rule: SteadyingRule) -> Channels:
+    """The part of a difference that is taken back."""
+    largest = np.abs(difference).max(-1, keepdims=True)
+    return rule.weight * np.exp(-((largest / rule.similar) ** 2)) * difference
+
+
+def _grey(image: Channels) -> UInt8[np.ndarray, "height width"]:
+    return np.asarray(cv2.cvtColor((255 * image[..., :3]).astype(np.uint8), cv2.COLOR_RGB2GRAY))
+
+
+def _channels(image: Float[Tensor, "4 height width"]) -> Channels:
+    return image.permute(1, 2, 0).float().cpu().contiguous().numpy()
