@@ -22,6 +22,8 @@ from viewmend.scenes.held_out import LeaveOneOut
 from viewmend.scenes.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.stream import Stream
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.training import scenes as scenes_module
+from viewmend.training.held_back import HeldBack
 from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.samples import HeldOutCamera, Sample, rig_samples
 from viewmend.training.scenes import (
@@ -243,7 +245,7 @@ def test_the_truth_of_a_capture_is_the_image_of_the_held_out_camera(studio):
         assert torch.equal(sample.truth, expected)
 
 
-def test_a_capture_is_aligned_without_the_held_out_camera():
+def test_a_capture_is_aligned_once_without_the_camera_that_is_held_back(monkeypatch):
     class Shifted(Studio):
         """States wrong principal points."""
 
@@ -255,11 +257,23 @@ def test_a_capture_is_aligned_without_the_held_out_camera():
             return replace(super().read(time), cameras=self.cameras)
 
     capture = Shifted(StudioConfig(seed=3, cameras=6, frames=2, size_px=96))
-    samples = capture_samples(capture).scene(0)
-    assert samples
+    back = capture.cameras.names[2]
+    used = []
+
+    def record(source, inputs, **options):
+        used.append(list(inputs))
+        return prepare(source, inputs, **options)
+
+    monkeypatch.setattr(scenes_module, "prepare", record)
+    rigs = CaptureRigs([(capture, None)], SCENES, (0, 1), "0", [HeldBack(back, 2)])
+    made = SampleScenes(rigs, SCENES, SAMPLING)
+    samples = made.scene(0) + made.scene(1)
+    others = [name for name in capture.cameras.names if name != back]
+    assert samples and used == [others]
+    expected = prepare(capture, others).cameras
     for sample in samples:
         held = sample.view.camera.names[0]
-        expected = prepare(capture, [n for n in capture.cameras.names if n != held]).cameras
+        assert held != back
         assert torch.equal(sample.view.camera.K, expected.select([held]).K)
         near = sample.context[0].frame.cameras
         assert torch.equal(near.K, expected.select(near.names).K)

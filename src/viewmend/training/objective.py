@@ -30,6 +30,8 @@ Planes = Sequence[Float[Tensor, "_h _w"]]
 MIN_SQUARE = 1e-4
 """Added to squared errors before the logarithm: no gain beyond 40 dB."""
 WEIGHT_DECAY = 0.01
+WARMUP_PROGRESS = 0.1
+"""The share of a run after which the learning rate is no longer warmed up."""
 TILE_PX = 256
 SHOWN_VIEWS = 8
 """Views in the image of a validation."""
@@ -105,8 +107,12 @@ class Objective(nn.Module, Generic[Model]):
         return torch.optim.AdamW(parameters, lr=learning_rate, weight_decay=WEIGHT_DECAY)
 
     def learning_rate_factor(self, step: int, progress: float, warmup: int) -> float:
-        """Factor of the peak learning rate: linear warm-up, then a cosine to 0 as `progress` goes from 0 to 1."""
-        return min((step + 1) / warmup, 1.0) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+        """Factor of the peak learning rate: linear warm-up, then a cosine to 0 as `progress` goes from 0 to 1.
+
+        Warm-up ends after `warmup` steps, or after a tenth of a shorter run.
+        """
+        warm = max((step + 1) / warmup, progress / WARMUP_PROGRESS)
+        return min(warm, 1.0) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
     def save(self, model: nn.Module, folder: Path, card: str) -> None:
         """Write a model of this objective, usually the averaged one, with its card."""

@@ -126,7 +126,11 @@ def random_studio(
 
 @dataclass(frozen=True)
 class CaptureRigs:
-    """Frames of captures, resized to the config's sizes and aligned on the cameras that are not held out."""
+    """Frames of captures, resized to the config's sizes and aligned.
+
+    A capture is aligned once, on all cameras but the one that is held back or the only truth. An
+    alignment without each camera in turn would take longer than fine-tuning has.
+    """
 
     captures: Sequence[tuple[CaptureSource, str | None]]
     """Each with the one camera that is held out, or None for all in turn."""
@@ -135,7 +139,7 @@ class CaptureRigs:
     seed: str
     held_back: Sequence[HeldBack | None] = ()
     """What is never used of each capture."""
-    _prepared: dict[tuple[int, str], PreparedCapture] = field(default_factory=dict)
+    _prepared: dict[int, PreparedCapture] = field(default_factory=dict)
 
     def rig(self, number: int) -> Scene:
         """Some frames of a random capture."""
@@ -156,13 +160,14 @@ class CaptureRigs:
         ]
         frames = {time: frame.select(complete) for time, frame in frames.items()}
 
+        if which not in self._prepared:
+            unused = (held_out, None if own is None else own.camera)
+            inputs = [name for name in capture.cameras.names if name not in unused]
+            self._prepared[which] = prepare(capture, inputs, match_colours=False, tighten_masks=False)
+        aligned = replace(self._prepared[which], max_image_size=size_px).cameras
+
         def cameras(held: str) -> Cameras:
-            if (which, held) not in self._prepared:  # aligned when this camera is first held out
-                others = [n for n in capture.cameras.names if n != held and (own is None or n != own.camera)]
-                self._prepared[which, held] = prepare(
-                    capture, others, match_colours=False, tighten_masks=False
-                )
-            return replace(self._prepared[which, held], max_image_size=size_px).cameras
+            return aligned
 
         return Scene(LeaveOneOut(frames, capture.bounds, cameras), random, held_out)
 
@@ -194,7 +199,7 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
     if not folders:
         return studio
     opened = [own for folder in folders for own in open_training_captures(folder, config.hold_out)]
-    # Only for its checks: each held-out camera has its own alignment.
+    # Only for its checks: captures are aligned without the cameras that are held back.
     captures = [
         (prepare(own.source, align=False, match_colours=False, tighten_masks=False), own.left_out)
         for own in opened
