@@ -7,15 +7,15 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 5,
+    "parallel": 4,
     "walruses": 30,
-    "prepositions": 5,
-    "late_constants": 24,
+    "prepositions": 4,
+    "late_constants": 18,
     "statements": 3,
-    "locals": 21,
+    "locals": 20,
 }
 """The most of each pattern in the package."""
-MAX_LONG_LINES_PERCENT = 1.6
+MAX_LONG_LINES_PERCENT = 1.5
 """The most lines over 110 columns, per cent of the non-blank lines."""
 
 

@@ -113,7 +113,7 @@ def run(options: Options) -> int:
 
 
 def _announce_held_out(config: TrainConfig) -> None:
-    """Before fine-tuning: which camera and frames are held out, and what the time limit includes."""
+    """Print which camera and frames are held out, and what the time limit includes."""
     from viewmend.cli.console import say
     from viewmend.training.held_back import open_training_captures
 
@@ -129,7 +129,7 @@ def _announce_held_out(config: TrainConfig) -> None:
 
 
 def _show_gain(options: Options, trained_s: float) -> None:
-    """After fine-tuning: what was kept and why, and the scores before and after by camera with a contact sheet."""
+    """Print what fine-tuning kept and why, and the scores before and after by camera; write a contact sheet."""
     scenes = options.config.scenes
     start = options.config.start
     if scenes.hold_out is None or start is None or not scenes.captures:

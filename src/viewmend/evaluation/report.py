@@ -65,6 +65,37 @@ RULES = (
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
 )
 """Definitions of the figures, printed with every report."""
+FIRST_COLUMNS = 3
+"""A page shows this many scores, the first of `COLUMNS`, before it is asked for all of them."""
+SPREAD = (
+    ("psnr", "holes"),
+    ("psnr", "holes_fg"),
+    ("psnr", "others"),
+    ("psnr", "past"),
+    ("psnr", "whole"),
+    ("psnr", "subject"),
+)
+"""Columns that also show the standard error over scenes."""
+REST_MEANINGS = {
+    f"over {REFERENCE}": f"Mean gain over {REFERENCE} in the holes, dB, over the scenes where both have a score.",
+    "VFID": "Frechet distance of videos (I3D) over all pixels; lower is better.",
+    "ms": "Median milliseconds of the method's step, without hull and rendering.",
+    "ms p95": "95th percentile of the milliseconds.",
+    "scenes": "Scenes with a score in the holes.",
+    "failed": "Scenes in which the method failed.",
+}
+"""What the columns after the scores hold."""
+EMPTY = ("", "-", "n/a", "0")
+READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
+"""Readings of each score: heading, region."""
+SCORES = (
+    ("PSNR", "psnr", 2),
+    ("SSIM", "ssim", 5),
+    ("LPIPS Alex", "lpips_alex", 4),
+    ("LPIPS VGG", "lpips_vgg", 4),
+)
+"""Heading, metric, decimals."""
+VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
 
 
 @dataclass(frozen=True)
@@ -144,37 +175,6 @@ COLUMNS = (
     ),
 )
 """The scores of the main table."""
-FIRST_COLUMNS = 3
-"""A page shows this many scores, the first of `COLUMNS`, before it is asked for all of them."""
-SPREAD = (
-    ("psnr", "holes"),
-    ("psnr", "holes_fg"),
-    ("psnr", "others"),
-    ("psnr", "past"),
-    ("psnr", "whole"),
-    ("psnr", "subject"),
-)
-"""Columns that also show the standard error over scenes."""
-REST_MEANINGS = {
-    f"over {REFERENCE}": f"Mean gain over {REFERENCE} in the holes, dB, over the scenes where both have a score.",
-    "VFID": "Frechet distance of videos (I3D) over all pixels; lower is better.",
-    "ms": "Median milliseconds of the method's step, without hull and rendering.",
-    "ms p95": "95th percentile of the milliseconds.",
-    "scenes": "Scenes with a score in the holes.",
-    "failed": "Scenes in which the method failed.",
-}
-"""What the columns after the scores hold."""
-EMPTY = ("", "-", "n/a", "0")
-READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
-"""Readings of each score: heading, region."""
-SCORES = (
-    ("PSNR", "psnr", 2),
-    ("SSIM", "ssim", 5),
-    ("LPIPS Alex", "lpips_alex", 4),
-    ("LPIPS VGG", "lpips_vgg", 4),
-)
-"""Heading, metric, decimals."""
-VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
 
 
 @dataclass(frozen=True)

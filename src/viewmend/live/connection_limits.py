@@ -41,9 +41,9 @@ UNREAD_BYTES = 64_000
 PIECE_BYTES = 4096
 """Unauthenticated input is handed to uvicorn in pieces of at most this size."""
 PAUSE_FACTOR = 4.0
-"""After a turn, unauthenticated clients wait for this multiple of its processor time."""
+"""Pause of unauthenticated clients after a turn, as a multiple of its processor time."""
 MIN_PAUSE_S = 0.005
-"""After a turn, unauthenticated clients wait for at least this many seconds."""
+"""Shortest pause of unauthenticated clients after a turn, seconds."""
 TOO_LARGE = b"\x88\x02\x03\xf1"
 """A WebSocket close frame with code 1009, message too large."""
 STATE_KEY = "connection"

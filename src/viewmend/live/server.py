@@ -50,6 +50,8 @@ EXTENSIONS = {
 }
 """Optional parts of the server: MODULE:FUNCTION of each, imported on demand. The function is called
 with the option's value, checks it, and returns an `ExtensionFactory`."""
+ExtensionFactory = Callable[[RenderService, "ServerConfig"], Extension]
+"""Makes an extension of a server with this service and config."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,16 +69,13 @@ class ServerConfig:
     draws_in_page: bool = True
     """Whether pages draw moving views by themselves."""
     limits: Limits = field(default_factory=Limits)
-    extensions: tuple["ExtensionFactory", ...] = ()
+    extensions: tuple[ExtensionFactory, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
             raise ValueError(f"expected a port from 0 to 65535, got {self.port}; 0 takes a free one")
         if self.budget_ms is not None and not self.budget_ms > 0:
             raise ValueError(f"expected a budget_ms above 0, or None for no limit, got {self.budget_ms}")
-
-
-ExtensionFactory = Callable[[RenderService, ServerConfig], Extension]
 
 
 def load_extension(name: str, value: Any) -> ExtensionFactory:

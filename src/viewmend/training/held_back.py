@@ -306,7 +306,9 @@ class KeptWeights:
         kept_step, kept, best = scored[0]
         for step, scores, score in scored[1:]:
             if is_better(score, best):
-                kept_step, kept, best = step, scores, score
+                kept_step = step
+                kept = scores
+                best = score
         gains = [score - scored[0][2] for _, _, score in scored[1:]]
         return cls(kept_step, scored[-1][0], scored[0][1], kept, max(gains, default=0.0))
 

@@ -493,7 +493,8 @@ def _match_some(names: Sequence[str], paths: Iterable[str]) -> NameMatch:
     files = {path: normalize("NFC", Path(path).name) for path in paths}
     stems = {path: Path(name).stem if _has_file_suffix(name) else name for path, name in files.items()}
     best = NameMatch({}, {})
-    for key in _KEYS:
+    comparisons: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)  # strictest first
+    for key in comparisons:
         by_key: dict[Hashable, list[str]] = {}
         for path, stem in stems.items():
             by_key.setdefault(key(stem), []).append(path)
@@ -523,10 +524,6 @@ def _after_cam(text: str) -> str:
 def _last_number(text: str) -> int | None:
     found = re.findall(r"\d{1,9}", text)
     return int(found[-1]) if found else None
-
-
-_KEYS: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)
-"""Comparisons of names, the strictest first."""
 
 
 def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str, Any], frozenset[str]]]:

@@ -22,6 +22,19 @@ OUTLINE_PX = 2
 """How far from the outline pixels may be soft."""
 LEAST_SHARE = 0.2
 """A share of subject below this is noise, one so near to 1 is whole."""
+MOVES = 1 / 60
+"""This share of the longer side is how far a part may move from one time to the next."""
+KEYS = {"green": 1, "blue": 2}
+"""The channel that a screen of this colour is brightest in."""
+SURE = 0.5
+"""Pixels this far from the key's colour are foreground, as a share of the key's own excess."""
+POSSIBLE = 0.3
+"""Pixels this far from the key's colour are foreground where they touch sure ones, as a share of
+its excess."""
+DARK = 24
+"""A key that is darker than this, in levels, is black: what is brighter is foreground."""
+EDGE = 1 / 100
+"""Spill is taken away up to this share of the image's longer side from the outline."""
 
 
 @runtime_checkable
@@ -77,10 +90,6 @@ def _large(inside: Inside, least_px: float) -> Inside:
     return kept[np.asarray(labels, np.int32)]
 
 
-MOVES = 1 / 60
-"""This share of the longer side is how far a part may move from one time to the next."""
-
-
 def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
     """The mask without parts that are absent from both neighbouring frames; None: there is no such frame."""
     others = [other for other in (before, after) if other is not None]
@@ -90,19 +99,6 @@ def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
     near = np.maximum.reduce(others) > 127
     near = np.asarray(cv2.dilate(near.astype(np.uint8), np.ones((reach, reach), np.uint8))) > 0
     return np.where(_connected(mask > 0, near), mask, 0).astype(np.uint8)
-
-
-KEYS = {"green": 1, "blue": 2}
-"""The channel that a screen of this colour is brightest in."""
-SURE = 0.5
-"""Pixels this far from the key's colour are foreground, as a share of the key's own excess."""
-POSSIBLE = 0.3
-"""Pixels this far from the key's colour are foreground where they touch sure ones, as a share of
-its excess."""
-DARK = 24
-"""A key that is darker than this, in levels, is black: what is brighter is foreground."""
-EDGE = 1 / 100
-"""Spill is taken away up to this share of the image's longer side from the outline."""
 
 
 class ChromaMasks:

@@ -31,6 +31,7 @@ GAP = 1 / 24
 support it."""
 GROUP = 3
 """Cameras per group; a pixel is kept if any group supports it, so that one bad mask has no effect."""
+CleanUp = Literal["none", "parts", "pixels"]
 
 
 def agreed(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
@@ -77,9 +78,6 @@ def _judged(own: Mask, some: Inside, all_: Inside) -> Mask:
     kept = np.where(some, own, 0).astype(np.uint8)
     around = np.asarray(cv2.morphologyEx(kept, cv2.MORPH_CLOSE, disc))
     return np.where(all_, np.maximum(kept, around), kept).astype(np.uint8)
-
-
-CleanUp = Literal["none", "parts", "pixels"]
 
 
 @dataclass

@@ -26,6 +26,10 @@ SHADOW_COST = 0.1
 """How much of a shadow's darkening counts as difference."""
 MOST_GAIN = 1.6
 """A camera whose exposure wandered by more than this factor is not brought back to its plate."""
+CAMERA = "{camera}"
+"""Stands for a camera's name in the path of plates."""
+MOST_FRAMES = 25
+"""Maximum number of frames for the median, evenly spread."""
 
 
 class PlateMasks:
@@ -88,12 +92,6 @@ def _smooth(rgb: Rgb) -> Colours:
 def _lab(rgb: Colours) -> Colours:
     """CIELAB with L from 0 to 255, like OpenCV's of 8 bits."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.float32) * np.array([2.55, 1, 1], np.float32)
-
-
-CAMERA = "{camera}"
-"""Stands for a camera's name in the path of plates."""
-MOST_FRAMES = 25
-"""Maximum number of frames for the median, evenly spread."""
 
 
 def plates_from_files(capture: CaptureFolder, place: str) -> dict[str, Rgb]:
