@@ -205,8 +205,9 @@ export class Assets extends EventTarget {
       return false;
     }
     const played = this.modes.map((mode) => sourcesOf(shape, eye, mode, this.fillers));
-    const wanted = playing ? played.flatMap(({ first, fill }) => [...first, ...fill]) : [...this.needed(frame, eye), ...rankedCameras(shape, eye)];
-    const missing = [...new Set(wanted)].filter((n) => !images.has(n));
+    const wanted = playing ? played.flatMap(({ first, fill }) => [...first, ...fill]) : rankedCameras(shape, eye);
+    const begins = !playing && !this.drawable(frame, eye); // the first picture shares the line with nothing else
+    const missing = [...new Set(begins ? this.needed(frame, eye) : wanted)].filter((n) => !images.has(n));
     for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
     return missing.length === 0;
   }
