@@ -7,12 +7,12 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 4,
-    "walruses": 30,
-    "prepositions": 4,
-    "late_constants": 18,
+    "parallel": 10,
+    "walruses": 35,
+    "prepositions": 8,
+    "late_constants": 20,
     "statements": 3,
-    "locals": 20,
+    "locals": 21,
 }
 """The most of each pattern in the package."""
 MAX_LONG_LINES_PERCENT = 1.5
