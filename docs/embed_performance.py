@@ -14,7 +14,8 @@ FRONT_PAGE = "index.md"
 FRAME = (
     '<iframe src="performance/index.html" title="A synthetic performer" loading="lazy" '
     'allow="fullscreen; clipboard-write" '
-    'style="width: 100%; aspect-ratio: 16 / 10; border: 0; border-radius: 8px; background: #000"></iframe>\n\n'
+    'style="width: 100%; aspect-ratio: 16 / 10; min-height: 360px; border: 0; border-radius: 8px">'
+    "</iframe>\n\n"
     "Drag to turn around the performer; [Publish a performance](guide/publish.md) says how this page was made."
 )
 """The markdown of the performance."""
