@@ -1,5 +1,6 @@
 """The recipes, the image losses of section 8, the ray fill's objective, and objectives from outside of the package."""
 
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -65,6 +66,15 @@ def test_fine_tuning_uses_the_objective_of_its_model(start, kind, model):
     assert isinstance(config.objective, kind) and isinstance(config.objective.model, model)
     assert config.start == start and config.learning_rate < make_recipe("views").learning_rate
     assert make_recipe("finetune").start == "views"
+
+
+@pytest.mark.parametrize(
+    ("step", "progress", "factor"), [(5, 0.0, 0.1), (59, 0.01, 1.0), (2, 0.05, 0.5), (4, 0.1, 1.0)]
+)
+def test_warm_up_ends_after_its_steps_or_a_tenth_of_the_run(step, progress, factor):
+    found = Objective.learning_rate_factor(None, step, progress, 60)  # pyright: ignore
+    cosine = 0.5 * (1 + math.cos(math.pi * progress))
+    assert found == pytest.approx(factor * cosine)
 
 
 def test_impossible_values_are_refused(tiny):

@@ -130,15 +130,22 @@ def paper_small() -> TrainConfig:
 
 
 def finetune(start: str = "views") -> TrainConfig:
-    """A trained model adapted to your own captures for 20 minutes, mixed with studio scenes against forgetting.
+    """A trained model adapted to your own captures for 20 minutes.
+
+    `views` trains on the captures alone, at a rate at which few steps count; the weights that are
+    best on what is held back are kept. Other models are mixed with studio scenes against forgetting.
 
     Raises:
         WeightsError: the model does not exist, or is damaged.
     """
     model = load_config(start)
+    learning_rate = 1e-4
+    captures_fraction = 0.5
     if isinstance(model, ViewsConfig):
         config = views()
         objective = ViewsObjectiveConfig(model=model, coarse_from=start)
+        learning_rate = 4e-4
+        captures_fraction = 1.0
     elif isinstance(model, PaperConfig):
         config = replace(paper_small(), scenes=SMALL_RIGS, replay_size=600)
         sampling = replace(PaperObjectiveConfig().sampling, min_history=0)  # captures may be short
@@ -150,16 +157,18 @@ def finetune(start: str = "views") -> TrainConfig:
         config,
         name="finetune",
         objective=objective,
-        scenes=replace(config.scenes, hold_out="auto", sizes_px=CAPTURE_SIZES_PX, captures_fraction=0.5),
+        scenes=replace(
+            config.scenes, hold_out="auto", sizes_px=CAPTURE_SIZES_PX, captures_fraction=captures_fraction
+        ),
         start=start,
         steps=4000,
         minutes=20.0,
         new_per_batch=1,
-        learning_rate=1e-4,
+        learning_rate=learning_rate,
         warmup=60,
         ema=0.995,
         checkpoint_minutes=2.0,
-        validate_every=60,
+        validate_every=30,
     )
 
 
