@@ -6,10 +6,21 @@ import numpy as np
 import pytest
 import torch
 from reference.ball import camera_at, proxy
+from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import project
 from viewmend.geometry.mesh import Mesh
-from viewmend.rendering.proxy_views import BEHIND, CLAY, DOT, GRAZING, MAX_DOT_PX, hull_points, shaded_hull
+from viewmend.rendering.proxy_views import (
+    BEHIND,
+    CLAY,
+    DOT,
+    GRAZING,
+    MAX_DOT_PX,
+    hull_points,
+    shaded_hull,
+    vertex_colours,
+)
+from viewmend.types import ContextViews, MultiViewFrame
 
 BALL = proxy(24)
 COLOURS = 0.5 + 0.4 * BALL.normals
@@ -75,3 +86,16 @@ def test_an_empty_proxy_gives_an_empty_image():
         hull_points(none, torch.zeros(0, 3), camera).abs().max() == 0 == shaded_hull(none, camera).abs().max()
     )
     assert hull_points(BALL, COLOURS, away).shape == (4, 32, 32)
+
+
+def test_vertices_that_no_camera_sees_have_the_colour_of_their_neighbours():
+    camera = camera_at(0, "front")
+    width, height = camera.max_size_px
+    red = torch.tensor([200, 40, 10], dtype=torch.uint8)
+    rgb = red[:, None, None].expand(1, 3, height, width).contiguous()
+    frame = MultiViewFrame(camera, rgb, (BALL.depth(camera) > 0).to(torch.uint8) * 255, 0)
+    to_camera = normalize(camera.centers - BALL.mesh.vertices, dim=-1)
+    behind = (BALL.normals * to_camera).sum(-1) < 0
+    colours = vertex_colours(BALL, ContextViews(frame, BALL.depth(camera)))
+    assert behind.sum() > 100
+    assert torch.allclose(colours, (red / 255).expand_as(colours), atol=0.01)
