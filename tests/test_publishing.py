@@ -34,7 +34,11 @@ def test_the_folder_has_the_page_and_every_frame(published):  # noqa: F811
         assert [camera.get("completed", False) for camera in header["cameras"]] == [False] * 6 + [True] * 4
         for n, camera in enumerate(header["cameras"]):
             rgb, mask = read_image((folder / f"{n}.bin").read_bytes(), camera)
-            assert rgb.shape[:2] == mask.shape == (camera["height"], camera["width"]) and mask.max() > 200
+            assert (
+                rgb is not None
+                and rgb.shape[:2] == mask.shape == (camera["height"], camera["width"])
+                and mask.max() > 200
+            )
 
 
 def test_all_addresses_are_relative_and_lead_to_files(published):  # noqa: F811

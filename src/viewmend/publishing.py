@@ -133,14 +133,16 @@ class SizeBudget:
             ValueError: it does not fit at the coarsest level.
         """
         share = self._bytes_left / self._frames_left
+        needed_bytes = 0
         for level in range(self.level, len(LEVELS)):
             assets = encode_frame(cached, completed, render, Detail(*LEVELS[level]))
-            if assets.size_bytes <= share:
+            needed_bytes = assets.size_bytes
+            if needed_bytes <= share:
                 self.level = level
-                self._bytes_left -= assets.size_bytes
+                self._bytes_left -= needed_bytes
                 self._frames_left -= 1
                 return assets
-        needed_mb = assets.size_bytes * self._frames_left / 1e6
+        needed_mb = needed_bytes * self._frames_left / 1e6
         raise ValueError(
             f"expected frames that fit into the size limit, got {needed_mb:.2f} MB for {self._frames_left} "
             f"frames at the lowest quality where {self._bytes_left / 1e6:.2f} MB are left; raise --max-mb, or "
