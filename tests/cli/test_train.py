@@ -74,10 +74,11 @@ def test_a_run_that_keeps_its_first_weights_says_so(capture, models, tmp_path, c
     assert finetune(capture, models / "views", tmp_path / "mine", "--validate-every", "1") == 0
     said = capsys.readouterr()
     assert "camera 'cam02' and the last frame (from" in said.err, "before the run begins"
-    assert "up to 20 minutes; the comparison by camera comes after them" in said.err
+    assert "up to 20 minutes; scoring views of each camera comes after them" in said.err
     assert f"kept the first weights: the result is '{models / 'views'}' unchanged" in said.out
-    assert "minutes" in said.out and "| camera |" not in said.out
-    assert not (tmp_path / "mine/comparison.png").exists()
+    assert "| camera | PSNR rendered | completed | LPIPS rendered | completed |" in said.out
+    assert "minutes of training and" in said.out
+    assert (tmp_path / "mine/comparison.png").exists()
 
 
 def test_a_model_in_the_folder_is_not_overwritten(capture, models, tmp_path, capsys):

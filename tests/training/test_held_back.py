@@ -126,13 +126,15 @@ def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):
     with torch.no_grad():
         bad.blending[-1].weight.zero_()
         bad.blending[-1].bias.fill_(-9.0)  # everything is transparent
-    lines = compare(place, AUTO, bad, good, tmp_path / "sheet.png").splitlines()
+    models = {"before": bad, "after": good}
+    lines = compare(place, AUTO, models, tmp_path / "sheet.png").splitlines()
     assert len(lines) == 7 and (tmp_path / "sheet.png").stat().st_size > 1000
     for line in lines[2:]:
-        _, psnr_before, psnr_after, lpips_before, lpips_after = (
+        _, psnr_rendered, psnr_before, psnr_after, lpips_rendered, lpips_before, lpips_after = (
             part.strip() for part in line.strip("|").split("|")
         )
         assert float(psnr_after) > float(psnr_before) and float(lpips_after) < float(lpips_before)
+        assert 10 < float(psnr_rendered) < float(psnr_after) and 0 < float(lpips_rendered) < 1
 
 
 def test_a_model_on_any_device_is_scored(place, monkeypatch):

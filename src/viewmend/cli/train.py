@@ -125,7 +125,7 @@ def _announce_held_out(config: TrainConfig) -> None:
             assert opened.held_back is not None, "something is held out"
             say(opened.held_back.describe(opened.source))
     if config.minutes is not None:
-        say(f"training takes up to {config.minutes:g} minutes; the comparison by camera comes after them")
+        say(f"training takes up to {config.minutes:g} minutes; scoring views of each camera comes after them")
 
 
 def _show_gain(options: Options, trained_s: float) -> None:
@@ -142,17 +142,16 @@ def _show_gain(options: Options, trained_s: float) -> None:
     kept = KeptWeights.of(read_validations(options.out))
     for text in [] if kept is None else kept.describe(start, options.config.validate_every):
         print(text)
-    if kept is not None and kept.step == 0:
-        print(f"took {trained_s / 60:.1f} minutes; there is nothing to compare")
-        return
     sheet = options.out / "comparison.png"
-    say("comparing both models by camera")
+    say("scoring views of each camera")
     began_s = time.monotonic()
-    before = load_inpainter(start)
-    print(compare(scenes.captures[0], scenes.hold_out, before, load_inpainter(options.out), sheet))
-    print(f"views before and after: {sheet}")
+    models = {"before": load_inpainter(start), "after": load_inpainter(options.out)}
+    if kept is not None and kept.step == 0:  # both are the same
+        models = {"completed": models["before"]}
+    print(compare(scenes.captures[0], scenes.hold_out, models, sheet))
+    print(f"PSNR of whole views in dB, LPIPS around the subject; the views: {sheet}")
     compared_s = time.monotonic() - began_s
-    print(f"took {trained_s / 60:.1f} minutes of training and {compared_s / 60:.1f} of comparison")
+    print(f"took {trained_s / 60:.1f} minutes of training and {compared_s / 60:.1f} of scoring views")
 
 
 def _line(progress: "Progress") -> str:

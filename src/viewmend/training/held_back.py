@@ -1,7 +1,7 @@
 """What fine-tuning never trains on: one camera of a capture and its last frames, for validation and the final table."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -149,6 +149,14 @@ class HeldBackView:
         stream.add_frame(*to_device((self.inputs.frame, self.inputs.proxy), device))
         completed = to_device(stream.view(self.truth.cameras.to(device)).completed, "cpu")
         rgb = composite(background, completed.rgb, completed.opacity)
+        return self._score(rgb, background, metric), completed
+
+    def score_rendered(self, completed: CompletedView, background: Background, metric: Lpips) -> "ViewScore":
+        """The scores of the view that was completed, as rendered."""
+        view = completed.view
+        return self._score(composite(background, view.cut_rgb, view.silhouette), background, metric)
+
+    def _score(self, rgb: Tensor, background: Background, metric: Lpips) -> "ViewScore":
         truth = camera_image(self.truth, background)
         found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
         assert found is not None and self.truth.mask is not None, (
@@ -156,7 +164,7 @@ class HeldBackView:
         )
         box = _subject_box(self.truth.mask[0])
         distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
-        return ViewScore(self.camera, self.trained_on, found, distance), completed
+        return ViewScore(self.camera, self.trained_on, found, distance)
 
 
 @dataclass(frozen=True)
@@ -329,19 +337,32 @@ class KeptWeights:
         return [text, advice] if few else [text]
 
 
-def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:
-    """A Markdown table of the scores before and after fine-tuning by camera; writes the views as a contact sheet."""
+def compare(place: Path, hold_out: str, models: Mapping[str, Inpainter], sheet: Path) -> str:
+    """A Markdown table of the scores of models by camera, next to those of the rendered views.
+
+    Args:
+        place: a capture, or a splits file, of which the first capture is used.
+        hold_out: the camera that was held out, or `AUTO`.
+        models: the models by their names in the table, such as "before" and "after".
+        sheet: the views are written to this file as a contact sheet.
+    """
     metric = load_lpips("alex")
     rows = []
-    lines = ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |"]
+    columns = ["camera", "PSNR rendered", *models, "LPIPS rendered", *models]
+    lines = [f"| {' | '.join(columns)} |", "| --- " * len(columns) + "|"]
     for view in held_back_views(place, hold_out, table=True):
-        old, old_view = view.score(before, metric)
-        new, new_view = view.score(after, metric)
+        made = {name: view.score(model, metric) for name, model in models.items()}
+        completed = [(name, own) for name, (_, own) in made.items()]
+        background = next(iter(models.values())).background or "black"
+        scores = [
+            view.score_rendered(completed[0][1], background, metric),
+            *(own for own, _ in made.values()),
+        ]
         note = " (its image was trained on)" if view.trained_on else ""
-        lines.append(
-            f"| {view.camera}{note} | {old.psnr_db:.2f} | {new.psnr_db:.2f} | {old.lpips:.4f} | {new.lpips:.4f} |"
-        )
-        rows.append(_row(view, [("before", old_view), ("after", new_view)], after.background or "black"))
+        psnrs_db = " | ".join(f"{score.psnr_db:.2f}" for score in scores)
+        distances = " | ".join(f"{score.lpips:.4f}" for score in scores)
+        lines.append(f"| {view.camera}{note} | {psnrs_db} | {distances} |")
+        rows.append(_row(view, completed, background))
     write_image(sheet, contact_sheet(rows, *TILE_PX))
     return "\n".join(lines)
 
