@@ -41,9 +41,8 @@ def render(frame: MultiViewFrame, target: Cameras, depth: torch.Tensor) -> Incom
     nearest = frame.select(names[:1])
     # From the view's pixels to points, and on to pixels of the nearest camera.
     v, u = torch.meshgrid(*(torch.arange(side) + 0.5 for side in depth.shape), indexing="ij")
-    in_view = (
-        target.K[0].inverse() @ torch.stack([u, v, torch.ones_like(u)]).reshape(3, -1) * depth.reshape(1, -1)
-    )
+    rays = target.K[0].inverse() @ torch.stack([u, v, torch.ones_like(u)]).reshape(3, -1)
+    in_view = rays * depth.reshape(1, -1)
     source_from_view = nearest.cameras.camera_from_world[0] @ target.camera_from_world[0].inverse()
     in_source = source_from_view[:3, :3] @ in_view + source_from_view[:3, 3:]
     projected = nearest.cameras.K[0] @ in_source
@@ -67,8 +66,8 @@ def main(out: Path, size_px: int = 256, time: int = 0) -> torch.Tensor:
     """Write the rendered view, and the completed one on grey; return rendered, completed and true colours."""
     studio = Studio(StudioConfig(seed=10003, cameras=6, frames=time + 1, size_px=size_px))
     target = orbit([0.5], (size_px, size_px), elevation_rad=0.3)
-    stream = Stream(load_inpainter("views"))
     surface = Surface(studio, time)
+    stream = Stream(load_inpainter("views"))
     stream.add_frame(studio.read(time), surface)
     view = render(studio.read(time), target, surface.depth(target)[0])
     completed = stream.mend(view).completed  # its colours are on black

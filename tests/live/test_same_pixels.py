@@ -43,7 +43,7 @@ def served(capture, model, align=True):
         source.stop()
 
 
-@pytest.mark.parametrize("model", ["rays", "telea"])
+@pytest.mark.parametrize("model", ["telea", pytest.param("rays", marks=pytest.mark.slow)])
 def test_serve_and_mend_show_the_same_pixels_of_wd2(shared, tmp_path, model):
     capture = shared / "captures/wd2"
     page, camera = served(capture, model)

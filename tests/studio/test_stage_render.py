@@ -88,7 +88,7 @@ def test_shadow_lookups_agree():
     slow, seen = unshadowed(pixels, z, depth), torch.zeros(2, 500)
     for n in range(2):
         arrays = (pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
-        _shade_numba.unshadowed(*arrays)
+        _shade_numba.shadow_visibility(*arrays)
     torch.testing.assert_close(seen, slow, atol=1e-5, rtol=0)
 
 
