@@ -96,7 +96,8 @@ def steadying_change(now: Channels, before: Channels) -> Channels:
     """What is added to a view, given the last one in the same image coordinates."""
     height, width = now.shape[:2]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow_px = np.asarray(search.calc(_grey(now), _grey(before), None), np.float32)
+    flow = search.calc(_grey(now), _grey(before), None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    flow_px = np.asarray(flow, np.float32)
     x_px = np.arange(width, dtype=np.float32) + flow_px[..., 0]
     y_px = np.arange(height, dtype=np.float32)[:, None] + flow_px[..., 1]
     moved = np.asarray(cv2.remap(before, x_px, y_px, cv2.INTER_CUBIC)).clip(0, 1)
