@@ -110,7 +110,7 @@ def test_a_bystander_whom_one_camera_sees_is_dropped(studio):
 
 @pytest.fixture
 def blind(studio, monkeypatch):
-    """The detector finds nobody in the second camera."""
+    """The detector finds no one in the second camera."""
     image = view_rgb(studio.read(0), 1)
     detect = person._detect
     monkeypatch.setattr(

@@ -137,7 +137,7 @@ def test_riftcasts_call_mends_holes_alone_bottom_up(net, package, program, tmp_p
     given = ViewInputs.of(view, context, net.config.num_views)
     image = torch.where(
         view.mask > 0, view.rgb, 1.0
-    )  # upon white, and four channels: as it is rendered there
+    )  # on white and with four channels, as it is rendered there
     shown = (torch.cat([image, torch.ones_like(image[:1])]) * 255).round().byte()
     more = {
         "image": shown.movedim(0, 2).flip(0).contiguous(),
