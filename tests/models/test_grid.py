@@ -60,6 +60,18 @@ def test_magnified_images_have_the_magnified_detail(rng):
     assert torch.allclose(magnified[centres], bands, atol=1e-5)
 
 
+@pytest.mark.parametrize("magnification", [0.5, 1.5, 3.0, 20.0])
+def test_detail_is_the_same_where_the_magnification_is_a_tensor(magnification, rng):
+    """So it is in exported models."""
+    shape = torch.Size((31, 40))
+    pixels = torch.nonzero(torch.rand(shape, generator=rng) < 0.6)
+    colours = torch.rand(len(pixels), 2, 3, generator=rng)
+    weight = 0.01 + torch.rand(len(pixels), generator=rng)
+    expected = detail_bands(colours, weight, pixels, shape, magnification)
+    bands = detail_bands(colours, weight, pixels, shape, torch.tensor(magnification).double())
+    assert torch.allclose(bands, expected, atol=1e-5)
+
+
 def test_squares_of_detail_grow_with_the_magnification():
     assert band_sides_px(0.4) == band_sides_px(1.0) == band_sides_px(1.25) == BAND_PX == (3, 7)
     assert [band_sides_px(factor) for factor in (2.0, 3.0, 6.1)] == [(5, 13), (9, 21), (17, 41)]

@@ -29,6 +29,7 @@ from viewmend.models.views.pyramids import (
     SceneScale,
     SourceCameras,
     choose_levels,
+    pixel_footprints,
 )
 from viewmend.models.views.ray_fill import gather_ray_inputs
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
@@ -216,6 +217,11 @@ class PackedSources(SourceCameras):
             levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
             mips += [packed.at(level) for level in levels]
         return mips
+
+    def magnification(self, viewer: Cameras, scale: SceneScale) -> Float[Tensor, ""]:
+        """`SourceCameras.magnification` as a tensor, on which the sides of the bands of detail depend."""
+        largest = pixel_footprints(self.cameras, viewer, scale).amax()
+        return (1 / largest.clamp_min(1e-6)).clamp_min(1)
 
 
 class PackedPyramids(NamedTuple):

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.rim import BEYOND_M
+from viewmend.models.views.box_sums import BoxSums
 from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
@@ -100,7 +101,7 @@ def detail_bands(
     weight: Float[Tensor, "pixel"],
     pixels: Pixels,
     shape: torch.Size,
-    magnification: float = 1.0,
+    magnification: float | Float[Tensor, ""] = 1.0,
 ) -> Float[Tensor, "pixel band image 3"]:
     """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
 
@@ -127,17 +128,25 @@ def detail_bands(
     return torch.stack(bands, 1)
 
 
-def band_sides_px(magnification: float) -> tuple[int, ...]:
+def band_sides_px(magnification: float | Float[Tensor, ""]) -> tuple[int | Int[Tensor, ""], ...]:
     """The sides of the squares around whose means there is detail: the largest odd numbers of pixels that fit."""
+    if isinstance(magnification, Tensor):
+        factors = magnification.clamp(1.0, MAX_MAGNIFICATION)
+        return tuple(2 * ((factors * side - 1) / 2).long() + 1 for side in BAND_PX)
     factor = min(max(magnification, 1.0), MAX_MAGNIFICATION)
     return tuple(2 * int((factor * side - 1) / 2) + 1 for side in BAND_PX)
 
 
 def _box_means_at(
-    image: Float[Tensor, "channel height width"], side: int, pixels: Pixels
+    image: Float[Tensor, "channel height width"], side: int | Int[Tensor, ""], pixels: Pixels
 ) -> Float[Tensor, "pixel channel"]:
     """Means over squares around pixels of an image, which is 0 beyond its border."""
     rows, columns = pixels.unbind(1)
+    if isinstance(side, Tensor):
+        # An exported model's kernels have constant sizes, so boxes of any side are summed
+        corners = torch.stack([-(side // 2), side // 2 + 1])
+        sums = BoxSums.of(image[None]).boxes(rows[:, None, None] + corners, columns[:, None, None] + corners)
+        return (sums[:, 0, 0, 0] / side.double() ** 2).float()
     if image.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_exporting():
         import cv2
 

@@ -408,7 +408,7 @@ def amplify_detail(
     gains: Float[Tensor, "pixel gain"],
     pixels: Pixels,
     shape: torch.Size,
-    magnification: float,
+    magnification: float | Float[Tensor, ""],
 ) -> Float[Tensor, "pixel 3"]:
     """The bands of detail of these images times their gains, summed; `mask` weighs the local means."""
     bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)

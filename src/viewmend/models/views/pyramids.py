@@ -244,10 +244,11 @@ class SourceCameras:
             found += [MipLevels.of(pyramids, fine), MipLevels.of(pyramids, wide)]
         return found
 
-    def magnification(self, viewer: Cameras, scale: SceneScale) -> float:
-        """How many pixels of the novel view a pixel of the sharpest source camera fills along a side, at least 1."""
-        if torch.compiler.is_exporting():
-            return 1.0
+    def magnification(self, viewer: Cameras, scale: SceneScale) -> float | Float[Tensor, ""]:
+        """How many pixels of the novel view a pixel of the sharpest source camera fills along a side, at least 1.
+
+        An exported model computes it as a tensor.
+        """
         largest = float(pixel_footprints(self.cameras.on_host, viewer.on_host, scale).amax())
         return max(1.0, 1 / max(largest, 1e-6))
 

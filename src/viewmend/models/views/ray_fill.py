@@ -18,12 +18,12 @@ from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.models.base import ContextProvider
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import MARGIN_PX, Fill, fill, pull_push
+from viewmend.models.views.box_sums import BoxSums
 from viewmend.models.views.config import CONTRAST, RaysConfig
 from viewmend.models.views.grid import Pixels
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.sampler import (
     CAMERA_CHANNELS,
-    BoxSums,
     CameraFeatures,
     Rays,
     RaySamples,
