@@ -15,7 +15,7 @@ from viewmend.cli import main
 from viewmend.data.capture_folder import open_capture
 from viewmend.data.checks import leave_one_out, synchronisation
 from viewmend.data.checks.colours import find_odd_images
-from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
+from viewmend.data.checks.diagnosis import diagnose, find_bad_masks, find_wrong_unit
 from viewmend.data.checks.leave_one_out import OthersHulls, find_outlier_by_hull, find_outlier_by_outlines
 from viewmend.data.checks.synchronisation import (
     check_image_mask_sync,
@@ -197,6 +197,20 @@ def test_a_wrong_unit_is_reported(folder, caplog):
     edit_description(folder, lambda content: content.update(metres_per_unit=0.01))
     prepare(open_capture(folder), align=False)
     assert "check metres_per_unit" in caplog.text
+
+
+def test_a_rig_of_an_impossible_size_is_reported_once(folder, caplog, monkeypatch):
+    edit_description(folder, lambda content: content.update(metres_per_unit=1000))
+    cameras = open_capture(folder).cameras
+    (found,) = find_wrong_unit(cameras)
+    assert "a rig of 0.05 to 500 m" in found.text and "viewmend convert" in found.text
+    assert find_wrong_unit(cameras, [found]) == ()
+    prepare(open_capture(folder), align=False)
+    assert caplog.text.count("check metres_per_unit") == 1
+    caplog.clear()
+    monkeypatch.setattr("viewmend.data.prepare.diagnose", lambda frame, bounds: ())
+    prepare(open_capture(folder), align=False)
+    assert caplog.text.count("a rig of 0.05 to 500 m") == 1
 
 
 def delay(*kinds):

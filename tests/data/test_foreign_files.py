@@ -244,6 +244,32 @@ def test_times_of_transforms_are_frames(tmp_path):
     assert not capture.gaps and capture.read(2).rgb[1, 0, 0, 0] == 10
 
 
+@pytest.mark.parametrize("shift", [0.0, 1e-4], ids=["the same poses", "poses of each image"])
+def test_a_fixed_rig_of_several_times_needs_no_time(tmp_path, shift):
+    content = films(tmp_path)
+    for number, frame in enumerate(content["frames"]):
+        frame.pop("time")
+        frame["transform_matrix"][0][3] += shift * (number % 2)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = open_capture(tmp_path)
+    assert capture.cameras.names == ("c0", "c1", "c2") and capture.frame_ids == ("0000", "0005", "0010")
+    assert capture.read(2).rgb[1, 0, 0, 0] == 10
+
+
+def test_images_that_transforms_do_not_mention_are_named(tmp_path, caplog):
+    content = films(tmp_path, times=(0,))
+    (tmp_path / "image").rename(tmp_path / "images")
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace("image", "images", 1)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    open_capture(tmp_path)
+    assert not caplog.messages
+    lost = content["frames"].pop()["file_path"].replace("\\", "/")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    open_capture(tmp_path)
+    assert f"images that the calibration does not mention are ignored: {lost}" in caplog.text
+
+
 def spoil(content, **changes):
     content["frames"][0] |= changes
 
@@ -253,7 +279,7 @@ def spoil(content, **changes):
     [
         (lambda c: spoil(c, time=None), "expected a 'time' in each frame"),
         (
-            lambda c: [f.pop("time") for f in c["frames"]],
+            lambda c: [f.pop("time") and f.update(depth_file_path="d.png") for f in c["frames"]],
             "got image/c0_0000.png and image/c0_0005.png at the same",
         ),
         (lambda c: spoil(c, file_path="image/other.png"), "expected equal numbers in file_path"),

@@ -11,7 +11,6 @@ import tyro
 if TYPE_CHECKING:
     from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.checks.calibration import CalibrationCheck
-    from viewmend.data.errors import Issue
     from viewmend.types import MultiViewFrame
 
 FEW_CAMERAS = 6
@@ -20,10 +19,6 @@ WIDE_DEG = 60.0
 """Artefacts are expected if neighbouring cameras are farther apart than this angle, degrees."""
 ADVISED_DEG = 45
 """Rigs with wider angles are advised to place neighbouring cameras this far apart, degrees."""
-MIN_RIG_M = 0.05
-"""Rigs whose longest side is shorter than this, metres, have the wrong unit."""
-MAX_RIG_M = 500.0
-"""Rigs whose longest side is longer than this, metres, have the wrong unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +59,7 @@ def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, 
     from viewmend.cli.console import busy, say
     from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.checks.calibration import check_calibration, draw_check
+    from viewmend.data.checks.diagnosis import find_wrong_unit
     from viewmend.data.checks.synchronisation import find_desynchronised_cameras
     from viewmend.data.errors import without_consequences
     from viewmend.data.images import check_image_name, write_image
@@ -80,8 +76,7 @@ def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, 
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
         found = (*capture.issues, *without_consequences(check.issues, late), *late)
-        unit = () if any("metres_per_unit" in issue.text for issue in found) else _find_wrong_unit(capture)
-        check = replace(check, issues=(*found, *unit))
+        check = replace(check, issues=(*found, *find_wrong_unit(capture.cameras, found)))
         changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good, check.issues)
     if options.out is not None:
         remove_partial_file(options.out)
@@ -89,18 +84,6 @@ def _check_capture(options: Options) -> "tuple[CaptureFolder, CalibrationCheck, 
             write_image(options.out, draw_check(check, capture.up))
         say(f"wrote {options.out}")
     return capture, check, changes
-
-
-def _find_wrong_unit(capture: "CaptureFolder") -> "tuple[Issue, ...]":
-    """A rig whose size cannot be in metres."""
-    from viewmend.data.errors import Issue
-
-    centers = capture.cameras.centers
-    size_m = float((centers.amax(0) - centers.amin(0)).max())
-    if MIN_RIG_M <= size_m <= MAX_RIG_M:
-        return ()
-    expected = f"a rig of {MIN_RIG_M} to {MAX_RIG_M:g} m"
-    return (Issue(f"expected {expected}, got one of {size_m:.3g} m; check metres_per_unit"),)
 
 
 def _frame(capture: "CaptureFolder", options: Options) -> "MultiViewFrame":

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from viewmend.data.capture_folder import CaptureFolder, open_capture
 from viewmend.data.checks.colours import find_blank_images
-from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
+from viewmend.data.checks.diagnosis import diagnose, find_bad_masks, find_wrong_unit
 from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
 from viewmend.data.errors import CaptureError, Issue, without_consequences
@@ -158,7 +158,7 @@ def prepare(
     frame = frame.without([issue.camera for issue in issues if issue.camera])
     late = find_desynchronised_cameras(source, frame, last) if align and not fatal else ()
     _raise_or_warn(at, without_consequences(issues, late), reported)
-    _raise_or_warn(where, late, reported)
+    _raise_or_warn(where, (*late, *find_wrong_unit(source.cameras, issues)), reported)
     prepared = PreparedCapture(source, None, max_image_size, names, left_out, _reported=reported)
     prepared = _adjusted(prepared, frame, issues, align, match_colours)
     return replace(prepared, loose_masks=find_loose_masks(frame)) if tighten_masks else prepared

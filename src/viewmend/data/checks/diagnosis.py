@@ -43,6 +43,12 @@ MIN_SIZE_M = 0.05
 """Subjects smaller than this, metres, usually have the wrong unit."""
 MAX_SIZE_M = 20.0
 """Subjects larger than this, metres, usually have the wrong unit."""
+MIN_RIG_M = 0.05
+"""Rigs whose longest side is shorter than this, metres, have the wrong unit."""
+MAX_RIG_M = 500.0
+"""Rigs whose longest side is longer than this, metres, have the wrong unit."""
+CHECK_UNIT = "check metres_per_unit in cameras.json (viewmend convert writes one from any format)"
+"""The next step after a wrong unit."""
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 """This matrix converts between OpenGL's and OpenCV's camera axes."""
 TURNED = {"mirrored": (1,), "upside down": (0,), "rotated by 180 degrees": (0, 1)}
@@ -69,11 +75,20 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue
         return (*issues, _explain(frame, bounds, iou))
     if not MIN_SIZE_M <= size_m <= MAX_SIZE_M:
         expected = f"a subject of about {MIN_SIZE_M} to {MAX_SIZE_M:g} m"
-        issues = (*issues, Issue(f"expected {expected}, got {size_m:.3g} m; check metres_per_unit"))
+        issues = (*issues, Issue(f"expected {expected}, got {size_m:.3g} m; {CHECK_UNIT}"))
     issues = (*issues, *_find_outlier(frame, bounds))
     issues = (*issues, *find_blank_images(frame.without([issue.camera for issue in issues if issue.camera])))
     consistent = frame.without([issue.camera for issue in issues if issue.camera])
     return (*issues, *find_odd_images(consistent, bounds))
+
+
+def find_wrong_unit(cameras: Cameras, found: Sequence[Issue] = ()) -> tuple[Issue, ...]:
+    """A rig whose size cannot be in metres; empty if an issue that was found already names the unit."""
+    size_m = float((cameras.centers.amax(0) - cameras.centers.amin(0)).max())
+    if MIN_RIG_M <= size_m <= MAX_RIG_M or any("metres_per_unit" in issue.text for issue in found):
+        return ()
+    expected = f"a rig of {MIN_RIG_M} to {MAX_RIG_M:g} m"
+    return (Issue(f"expected {expected}, got one of {size_m:.3g} m; {CHECK_UNIT}"),)
 
 
 def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:

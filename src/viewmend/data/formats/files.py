@@ -113,12 +113,16 @@ def names_from_paths(paths: Sequence[str]) -> list[str]:
 
 
 def names_of_patterns(patterns: Sequence[str]) -> list[str]:
-    """A name for each camera: what its images' names share."""
+    """A name for each camera: the last part of its images' paths, or else all parts in which the cameras differ."""
     shared = [path.rpartition(".")[0].replace("{frame}", "").rstrip("_-./ ") for path in patterns]
-    short = [path.rpartition("/")[2] for path in shared]
-    return (
-        short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
-    )
+    parts = [path.split("/") for path in shared]
+    last = [own[-1] for own in parts]
+    if len(set(last)) == len(last) and all(last):
+        return last
+    if len({len(own) for own in parts}) == 1:
+        differ = [at for at, found in enumerate(zip(*parts, strict=True)) if len(set(found)) > 1]
+        parts = [[own[at] for at in differ] for own in parts]
+    return ["_".join(own) for own in parts]
 
 
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:

@@ -1,6 +1,7 @@
 """`transforms.json` of nerfstudio, instant-ngp and Blender.
 
 Each of its frames is a camera of a single frame, or, if they have a `time`, a camera at one time.
+Without `time`, poses and names may show that a fixed rig was recorded at several times.
 """
 
 import math
@@ -19,7 +20,9 @@ from viewmend.data.formats.files import (
     names_from_paths,
     names_of_patterns,
     warn,
+    warn_of_unused_images,
 )
+from viewmend.data.formats.moments import PosedImage, fixed_cameras
 from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
@@ -131,7 +134,11 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     read = typed(parsed, _File, "see docs/formats.md")
     _check_keys(file, parsed)
     frames = [_with_local_paths(folder, frame) for frame in read.frames]
-    if len({frame.time for frame in frames}) <= 1:
+    if file.name == NAMES[0]:  # the others name a part of the images
+        paths = [(frame.file_path, frame.mask_path, frame.depth_file_path) for frame in frames]
+        warn_of_unused_images(folder, (str(PurePosixPath(path)) for own in paths for path in own if path))
+    is_timed = len({frame.time for frame in frames}) > 1
+    if not is_timed:
         frames = existing(folder, frames, lambda frame: frame.file_path)
     _check_suffixes(folder, frames)
     scales = {read.integer_depth_scale, read.depth_unit_scale_factor}
@@ -140,18 +147,36 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         raise ValueError(f"expected OpenGL axes and depth in millimetres (0.001), got {got}; export it again")
     named = any(frame.mask_path for frame in frames)
     alpha = not named and any(uses_alpha(folder / f.file_path) for f in frames if stays_inside(f.file_path))
+    rig = None
+    if not is_timed and not any(frame.depth_file_path for frame in frames):
+        rig = fixed_cameras([_posed(folder, read, frame, alpha) for frame in frames])
+    entries, ids = rig or _entries(folder, read, frames, alpha)
+    return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ids, "cameras": entries}
+
+
+def _entries(
+    folder: Path, file: _File, frames: list[_Entry], alpha: bool
+) -> tuple[list[dict[str, Any]], tuple[str, ...]]:
+    """The cameras by pose and `time`, and the frame ids; with `alpha`, images are their own masks."""
     cameras, ids = _cameras_of(frames)
     paths = [camera[0].file_path for camera in cameras]
     names = names_from_paths(paths) if len(ids) == 1 else names_of_patterns(paths)
     entries = []
     for (pattern, frame), name in zip(cameras, names, strict=True):
-        world_from_camera = np.array(frame.transform_matrix, float)[:3]
-        R = np.diag([1.0, -1.0, -1.0]) @ world_from_camera[:, :3].T  # from OpenGL to OpenCV axes
-        entry = {"name": name, **_intrinsics(folder, frame.file_path, read, frame)}
-        entry |= {"R": R.tolist(), "t": (-R @ world_from_camera[:, 3]).tolist()}
+        posed = _posed(folder, file, frame, alpha)
+        entry = {"name": name, **posed.lens, "R": posed.R.tolist(), "t": (-posed.R @ posed.center).tolist()}
         files = {"image": pattern.file_path, "mask": pattern.mask_path, "depth": pattern.depth_file_path}
         entries.append(entry | files | ({"mask": pattern.file_path} if alpha else {}))
-    return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ids, "cameras": entries}
+    return entries, ids
+
+
+def _posed(folder: Path, file: _File, frame: _Entry, alpha: bool) -> PosedImage:
+    """A frame's image, lens and pose; with `alpha`, the image is its own mask."""
+    world_from_camera = np.array(frame.transform_matrix, float)[:3]
+    R = np.diag([1.0, -1.0, -1.0]) @ world_from_camera[:, :3].T  # from OpenGL to OpenCV axes
+    mask = frame.file_path if alpha else frame.mask_path
+    lens = _intrinsics(folder, frame.file_path, file, frame)
+    return PosedImage(frame.file_path, mask, lens, R, world_from_camera[:, 3])
 
 
 def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
