@@ -109,6 +109,9 @@ FATAL = {
     "they are full": lambda f: change_images(f, lambda mask: 0 * mask + 255),
     "all masks are mirrored": lambda f: change_images(f, lambda mask: mask[:, ::-1]),
     "all masks are upside down": lambda f: change_images(f, lambda mask: mask[::-1]),
+    "all masks are rotated by 90 degrees clockwise": lambda f: change_images(
+        f, lambda mask: np.rot90(mask, -1)
+    ),
 }
 
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,6 +71,13 @@ def test_depth_is_kept_to_half_a_millimetre(plain, tmp_path, rng):
     far = Changed(open_capture(plain.path), lambda frame: replace(frame, depth=torch.full(depth.shape, 70.0)))
     with pytest.raises(CaptureError, match=r"0 to 65\.535 m, got 70"):
         write_capture(far, tmp_path / "far")
+
+
+def test_rotations_are_written_exactly(plain, tmp_path):
+    write_capture(open_capture(plain.path), tmp_path / "copy")
+    for camera in json.loads((tmp_path / "copy/cameras.json").read_text())["cameras"]:
+        R = np.array(camera["R"])
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
 
 
 def test_folders_in_use_are_not_changed(plain, tmp_path):

@@ -17,7 +17,7 @@ from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
 from viewmend.data.capture_folder import open_capture
-from viewmend.data.checks.leave_one_out import find_outlier_by_hull
+from viewmend.data.checks.leave_one_out import find_cut_off_subject, find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.native_writer import write_capture
@@ -233,6 +233,9 @@ def test_cameras_that_see_all_of_the_subject_are_not_blamed_for_borders(tmp_path
         assert [issue for issue in find_outlier_by_hull(cut, None) if issue.camera] == []
         hull = reconstruct(mask, cut.cameras)
         assert narrow == 7 or float(hull.bounds.size_m[1]) > 0.9
+        found = find_cut_off_subject(cut)
+        assert len(found) == (narrow == 7)
+        assert all("cut off by the image border of all cameras but" in issue.text for issue in found)
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (412345.6, 4512345.6, 210.0)])

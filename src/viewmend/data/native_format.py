@@ -221,17 +221,25 @@ def moved_to(calibration: NativeCalibration, origin_m: Float64[np.ndarray, "3"])
     return replace(calibration, cameras=cameras, bounds_m=bounds_m, origin_m=origin_m)
 
 
+def exact_pose(
+    R: Float64[np.ndarray, "3 3"], t: Float64[np.ndarray, "3"]
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """The nearest rotation to a rounded one, and the translation with which the camera keeps its position."""
+    u, _, vt = np.linalg.svd(R)
+    center = -np.linalg.solve(R, t)
+    return u @ vt, -(u @ vt) @ center
+
+
 def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
     K = np.array(entry.K)
     K[:2, 2] += shift_px
-    u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
-    centre = -np.linalg.solve(np.array(entry.R), np.array(entry.t))  # which the change of R would move
+    R, t = exact_pose(np.array(entry.R), np.array(entry.t))
     return NativeCamera(
         **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms")},
         **{kind: path and path.replace("\\", "/") for kind in FILE_KINDS for path in [getattr(entry, kind)]},
         K=K,
-        R=u @ vt,
-        t_m=-(u @ vt) @ centre * scale,
+        R=R,
+        t_m=t * scale,
         dist=np.array(entry.dist),
         colour=None if entry.colour is None else np.array(entry.colour),
     )

@@ -22,6 +22,7 @@ from viewmend.data.native_format import (
     FileKind,
     NativeCalibration,
     NativeCamera,
+    exact_pose,
     stays_inside,
     write_calibration,
 )
@@ -174,8 +175,7 @@ class _Writer:
         ):
             kinds = self.kinds if name in self.masked else self.kinds - {"mask"}
             files: Any = {kind: self._path(name, kind) if kind in kinds else None for kind in FILE_KINDS}
-            R = pose[view, :3, :3]
-            t_m = pose[view, :3, 3]
+            R, t_m = exact_pose(pose[view, :3, :3], pose[view, :3, 3])
             entries.append(NativeCamera(name, width, height, K[view], R, t_m, np.zeros(5), **files))
         return NativeCalibration(
             frames=tuple(source.frame_ids),

@@ -1,7 +1,7 @@
 """Finds and explains faults in the masks and the calibration of a frame, for `viewmend check` and `prepare`."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -9,7 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.data.checks.colours import find_blank_images, find_odd_images
-from viewmend.data.checks.leave_one_out import find_outlier_by_hull, find_outlier_by_outlines
+from viewmend.data.checks.leave_one_out import (
+    find_cut_off_subject,
+    find_outlier_by_hull,
+    find_outlier_by_outlines,
+)
 from viewmend.data.errors import Issue
 from viewmend.data.source import limit_size
 from viewmend.geometry.alignment import LEAST_IOU, silhouette_iou
@@ -51,8 +55,17 @@ CHECK_UNIT = "check metres_per_unit in cameras.json (viewmend convert writes one
 """The next step after a wrong unit."""
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 """This matrix converts between OpenGL's and OpenCV's camera axes."""
-TURNED = {"mirrored": (1,), "upside down": (0,), "rotated by 180 degrees": (0, 1)}
-"""Masks may be turned in these ways; each needs these axes flipped."""
+TURNED: dict[str, Callable[[Tensor], Tensor]] = {
+    "mirrored": lambda mask: mask.flip(1),
+    "upside down": lambda mask: mask.flip(0),
+    "rotated by 180 degrees": lambda mask: mask.flip(0, 1),
+}
+"""Masks may be turned in these ways, each of which the function undoes."""
+TURNED_SQUARES: dict[str, Callable[[Tensor], Tensor]] = {
+    "rotated by 90 degrees clockwise": lambda mask: mask.rot90(1),
+    "rotated by 90 degrees counter-clockwise": lambda mask: mask.rot90(-1),
+}
+"""Square masks may also be turned in these ways; others are recognised by their size."""
 
 
 def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue, ...]:
@@ -93,7 +106,7 @@ def find_wrong_unit(cameras: Cameras, found: Sequence[Issue] = ()) -> tuple[Issu
 
 def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
     """The camera that is inconsistent with the others, by the hull, unless the outlines point to another camera."""
-    by_hull = find_outlier_by_hull(frame, bounds)
+    by_hull = find_outlier_by_hull(frame, bounds) or find_cut_off_subject(frame)
     by_outlines = find_outlier_by_outlines(frame, bounds)
     if by_outlines is None or (by_hull and any(f"'{name}'" in by_hull[0].text for name in by_outlines[0])):
         return by_hull
@@ -187,9 +200,9 @@ def _explain(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Issue:
     best, issue = max(tried, key=lambda change: change[0], default=(0.0, Issue("")))
     if issue.camera is not None:
         view = frame.cameras.names.index(issue.camera)
-        for how in TURNED:
+        for how in _turns(frame):
             if _agreement(_turned(frame, [view], how), frame.cameras, bounds)[0] >= best - SAME_IOU:
-                text = f"the mask of camera '{issue.camera}' is {how}, so it is left out; flip it, or all its files"
+                text = f"the mask of camera '{issue.camera}' is {how}, so it is left out; turn it back"
                 issue = replace(issue, text=text)
     agreement = f"hull and masks agree only to an IoU of {iou:.3f}"
     if best >= max(LEAST_IOU, iou + MIN_IMPROVEMENT):
@@ -213,9 +226,9 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
         K = frame.cameras.K.clone()
         K[:, :2] /= factor
         yield _agreement(frame, replace(frame.cameras, K=K), bounds)[0], Issue(text, fatal=True)
-    for how in TURNED:
+    for how in _turns(frame):
         turned = _turned(frame, range(len(frame.cameras)), how)
-        text = f"all masks are {how}, judging by the calibration; flip them, and the images too if they are {how}"
+        text = f"all masks are {how}, judging by the calibration; turn them back, and the images too if they are {how}"
         yield _agreement(turned, frame.cameras, bounds)[0], Issue(text, fatal=True)
     if bounds is not None:
         iou, size_m = _agreement(frame, frame.cameras, None)
@@ -234,8 +247,14 @@ def _turned(frame: MultiViewFrame, views: Iterable[int], how: str) -> MultiViewF
     mask = frame.mask.clone()
     for view in views:
         width, height = frame.cameras.size_px[view].tolist()
-        mask[view, :height, :width] = frame.mask[view, :height, :width].flip(TURNED[how])
+        mask[view, :height, :width] = _turns(frame)[how](frame.mask[view, :height, :width])
     return replace(frame, mask=mask)
+
+
+def _turns(frame: MultiViewFrame) -> dict[str, Callable[[Tensor], Tensor]]:
+    """The ways in which the frame's masks may be turned."""
+    is_square = bool((frame.cameras.size_px[:, 0] == frame.cameras.size_px[:, 1]).all())
+    return TURNED | TURNED_SQUARES if is_square else TURNED
 
 
 def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Issue]]:

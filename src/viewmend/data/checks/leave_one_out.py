@@ -204,12 +204,21 @@ def _is_explained_by_borders(frame: MultiViewFrame, bounds: Bounds | None, view:
     return float(missed_share(own.mask > FOREGROUND, covered)[0]) <= OutlierThresholds().outside
 
 
+def find_cut_off_subject(frame: MultiViewFrame) -> tuple[Issue, ...]:
+    """An issue if fewer than two cameras see the whole subject within their borders."""
+    if frame.mask is None or count_cut_off(frame.mask, frame.cameras) < len(frame.cameras) - 1:
+        return ()
+    return (Issue(_cut_off_text(frame)),)
+
+
 def _cut_off_text(frame: MultiViewFrame) -> str:
     """Which cameras see a part of the subject only, and what follows."""
     assert frame.mask is not None
     cut = are_cut_off(frame.mask, frame.cameras).tolist()
     names = [name for name, is_cut in zip(frame.cameras.names, cut, strict=True) if is_cut]
     who = f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    who = f"all cameras but {frame.cameras.names[cut.index(False)]}" if cut.count(False) == 1 else who
+    who = "all cameras" if all(cut) else who
     return (
         f"the subject is cut off by the image border of {who}; parts "
         "that fewer than two cameras see are missing in views: move these cameras back, or turn them to the subject"
