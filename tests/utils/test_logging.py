@@ -53,6 +53,18 @@ def test_what_is_logged_is_a_line_a_message(terminal, monkeypatch):
     )
 
 
+def test_what_is_said_of_a_capture_is_said_once_a_command(terminal, monkeypatch):
+    unheard(monkeypatch)
+    for _ in range(2):
+        log_to_terminal()
+        for camera in ("a", "b", "a", "a"):
+            logging.getLogger("viewmend").warning("camera '%s' has no mask", camera)
+            logging.getLogger("viewmend.live").warning("camera '%s' is late", camera)
+        lines = terminal().splitlines()
+        assert lines.count("camera 'a' has no mask") == lines.count("camera 'b' has no mask") == 1
+        assert lines.count("camera 'a' is late") == 3
+
+
 def test_logs_that_somebody_hears_are_left_to_them(monkeypatch):
     unheard(monkeypatch)
     heard = logging.NullHandler()

@@ -159,12 +159,8 @@ class CaptureFolder:
         unused = ()
         if self.unmasked:
             names = ", ".join(f"'{name}'" for name in self.unmasked)
-            who, use = ("cameras", "they are") if len(self.unmasked) > 1 else ("camera", "it is")
-            unused = (
-                Issue(
-                    f"{who} {names}: expected masks as the other cameras have, got none, so {use} not used"
-                ),
-            )
+            who = f"cameras {names} are" if len(self.unmasked) > 1 else f"camera {names} is"
+            unused = (Issue(f"{who} not used: expected masks as the other cameras have, got none; add them"),)
         if self.clock is None:
             return unused
         listed = self._listed

@@ -23,18 +23,32 @@ def escaped_traceback(error: BaseException) -> str:
 def log_to_terminal() -> None:
     """Log warnings and errors of this process to standard error, one line per message.
 
-    Does nothing if the root logger already has a handler.
+    Messages about captures appear once, however often a command opens them. Does nothing if the
+    root logger already has another handler.
     """
-    if not logging.getLogger().handlers:
-        logging.getLogger().addHandler(_Lines(logging.WARNING))
+    handlers = logging.getLogger().handlers
+    for handler in handlers:
+        if isinstance(handler, _Lines):
+            handler.facts.clear()
+    if not handlers:
+        logging.getLogger().addHandler(_Lines())
 
 
 class _Lines(logging.Handler):
     """Writes records to the current standard error."""
 
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.facts: set[str] = set()
+        """Warnings of the logger `viewmend`, which are about files and do not change while a command runs."""
+
     def emit(self, record: logging.LogRecord) -> None:
         try:
             text = printable(record.getMessage())
+            if record.name == "viewmend":
+                if text in self.facts:
+                    return
+                self.facts.add(text)
             if record.exc_info and record.exc_info[1] is not None:
                 text += "\n" + escaped_traceback(record.exc_info[1])
             print(text, file=sys.stderr, flush=True)
