@@ -195,7 +195,8 @@ def test_a_camera_without_a_person_is_named_has_no_mask_and_is_not_used(half_bli
     assert main(["check", str(out)]) == 0
     printed = capsys.readouterr().out
     assert (
-        printed.count("cam01") == 1 and "camera 'cam01': expected masks as the other cameras have" in printed
+        printed.count("cam01") == 1
+        and "camera 'cam01' is not used: expected masks as the other cameras have" in printed
     )
     assert "hull IoU  mean 0.9" in printed
     assert "a capture with 5 cameras" in printed
