@@ -96,9 +96,8 @@ def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
 
 def test_cubic_samples_keep_straight_lines_and_overshoot_none(rng):
     ramp = (10 * torch.arange(12.0))[None, None, None].expand(1, 1, 9, 12).contiguous()
-    at = Projections(
-        *(5 + 2 * torch.rand(40, 1, 1, dtype=torch.double, generator=rng) for _ in range(3)), None
-    )
+    positions = 5 + 2 * torch.rand(40, 1, 1, 2, dtype=torch.double, generator=rng)
+    at = Projections(positions, torch.ones(40, 1, 1), torch.ones(40, 1, 1) > 0)
     levels = MipLevels.full(ramp)
     found = sample_level_cubic(levels, at, 1)
     assert torch.allclose(found, sample_level(levels, at, 1), atol=1e-5)

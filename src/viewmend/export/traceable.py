@@ -206,17 +206,18 @@ class PackedSources(SourceCameras):
         """Which cameras coloured the view: an input here, since cameras have no names."""
         return self.coloured
 
-    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
+    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> tuple[MipLevels, MipLevels]:
         """`SourceCameras.mips`."""
         images = PackedPyramids.of(self.images.float(), self.cameras.size_px, mask=3)
         masks = PackedPyramids.of(
             self.silhouettes.mask[:, None].float(), self.silhouettes.cameras.size_px, mask=0
         )
-        mips: list[MipLevels] = []
+        mips = []
         for packed, cameras in ((images, self.cameras), (masks, self.silhouettes.cameras)):
             levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
-            mips += [packed.at(level) for level in levels]
-        return mips
+            mips.append(packed.at(torch.stack(levels)))
+        of_images, of_masks = mips
+        return of_images, of_masks
 
     def magnification(self, viewer: Cameras, scale: SceneScale) -> Float[Tensor, ""]:
         """`SourceCameras.magnification` as a tensor, on which the sides of the bands of detail depend."""
@@ -255,9 +256,10 @@ class PackedPyramids(NamedTuple):
         last = (shortest > SMALLEST_PX).sum(1).clamp_max(LEVELS - 1)
         return cls(*_packed(levels), last, area.sqrt().clamp_min(1))
 
-    def at(self, level: Int[Tensor, "camera"]) -> MipLevels:
-        """One level of each camera."""
-        first = self.first[level] + torch.arange(level.shape[0]) * self.pixels.shape[1]
+    def at(self, levels: Int[Tensor, "level camera"]) -> MipLevels:
+        """Several levels of each camera."""
+        level = levels[:, None, None]
+        first = self.first[level] + torch.arange(levels.shape[1]) * self.pixels.shape[1]
         return MipLevels(
             self.pixels.flatten(0, 1), first, self.columns[level], self.size[level], 0.5 ** level.double()
         )

@@ -102,7 +102,7 @@ class Cameras(OnDevice):
 
     def _check_distance(self) -> None:
         """ValueError if the cameras are so far from the world's origin that 32-bit poses are too coarse."""
-        centers = self.centers.detach()
+        centers = self.on_host.centers.detach()
         extent_m = float((centers.amax(0) - centers.amin(0)).amax())
         away_m = float(centers.abs().amax())
         if extent_m > 0 and away_m > FARTHEST * extent_m:
@@ -132,13 +132,17 @@ class Cameras(OnDevice):
 
     @cached_property
     def world_from_camera(self) -> Float[Tensor, "view 4 4"]:
-        """Inverse of `camera_from_world`."""
+        """Inverse of `camera_from_world`; for another device it is computed on the CPU."""
+        if self.K.device.type != "cpu":
+            return self.on_host.world_from_camera.to(self.K.device)
         with torch.inference_mode(False):  # the result may be used with gradients later
             return invert_rigid(self.camera_from_world)
 
     @cached_property
     def camera_from_pixel(self) -> Float[Tensor, "view 3 3"]:
         """Inverse of K: from homogeneous pixel coordinates to rays of z = 1 in the camera's axes."""
+        if self.K.device.type != "cpu":
+            return self.on_host.camera_from_pixel.to(self.K.device)
         with torch.inference_mode(False):
             return torch.linalg.inv_ex(self.K).inverse
 

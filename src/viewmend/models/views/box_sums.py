@@ -18,32 +18,36 @@ class BoxSums(NamedTuple):
         """The sums of these images."""
         return cls(F.pad(images.movedim(1, 3).double(), (0, 0, 1, 0, 1, 0)).cumsum(1).cumsum(2))
 
+    def means(
+        self, uv_px: Float[Tensor, "ray sample image 2"], side: Int[Tensor, ""]
+    ) -> Float[Tensor, "ray sample image channel"]:
+        """Means over boxes of `side` pixels, bilinear between box centres, 255 as 1; zeros outside an image.
+
+        The four boxes around a position have nine corners, with a weight each.
+        """
+        position = uv_px * (1 / side.double()) - 0.5
+        first = position.floor()
+        share = position - first
+        corner = (first.long()[..., None] + torch.arange(3, device=uv_px.device)) * side
+        column, row = corner.unbind(-2)
+        across, down = torch.stack([share - 1, 1 - 2 * share, share], -1).unbind(-2)
+        weight = down[..., :, None] * across[..., None, :]
+        sums = (weight[..., None] * self._at(row, column)).sum((-3, -2))
+        return (sums / (255 * side.double() ** 2)).float()
+
     def boxes(
         self, row: Int[Tensor, "*box image row_corner"], column: Int[Tensor, "*box image column_corner"]
     ) -> Float[Tensor, "*box image row column channel"]:
         """Sums between neighbouring corners; corners outside an image are moved to its border."""
-        image = torch.arange(self.values.shape[0], device=row.device)[:, None, None]
-        rows, columns = self.values.shape[1:3]
-        inside_row = row.clamp(0).clamp_max(rows - 1)[..., :, None]
-        inside_column = column.clamp(0).clamp_max(columns - 1)[..., None, :]
-        corners = self.values.flatten(0, 2)[(image * rows + inside_row) * columns + inside_column]
-        return corners.diff(dim=-3).diff(dim=-2)
+        return self._at(row, column).diff(dim=-3).diff(dim=-2)
 
-    def means(
-        self,
-        u_px: Float[Tensor, "ray sample image"],
-        v_px: Float[Tensor, "ray sample image"],
-        side: Int[Tensor, ""],
-    ) -> Float[Tensor, "ray sample image channel"]:
-        """Means over boxes of `side` pixels, bilinear between box centres, 255 as 1; zeros outside an image."""
-        x = u_px * (1 / side.double()) - 0.5
-        y = v_px * (1 / side.double()) - 0.5
-        left = x.floor()
-        top = y.floor()
-        three_corners = torch.arange(3, device=x.device)
-        row = (top.long()[..., None] + three_corners) * side
-        column = (left.long()[..., None] + three_corners) * side
-        across = torch.stack([1 - (x - left), x - left], -1)
-        down = torch.stack([1 - (y - top), y - top], -1)
-        weights = (down[..., :, None] * across[..., None, :])[..., None]
-        return ((self.boxes(row, column) * weights).sum((-3, -2)) / (255 * side.double() ** 2)).float()
+    def _at(
+        self, row: Int[Tensor, "*box image row_corner"], column: Int[Tensor, "*box image column_corner"]
+    ) -> Float[Tensor, "*box image row_corner column_corner channel"]:
+        """Sums above and left of corners; corners outside an image are moved to its border."""
+        image = torch.arange(self.values.shape[0], device=row.device)[:, None]
+        rows, columns = self.values.shape[1:3]
+        inside_row = row.clamp(0).clamp_max(rows - 1)
+        inside_column = column.clamp(0).clamp_max(columns - 1)
+        first = (image * rows + inside_row) * columns
+        return self.values.flatten(0, 2)[first[..., :, None] + inside_column[..., None, :]]

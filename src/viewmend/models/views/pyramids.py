@@ -40,49 +40,67 @@ class SceneScale:
     def of(cls, view: IncompleteView) -> "SceneScale":
         """The scale of a view; 1 for both if the proxy covers nothing."""
         covered = view.depth > 0
-        count = covered.sum()
         if torch.compiler.is_exporting():
+            count = covered.sum()
             ordered = torch.where(covered, view.depth, torch.inf).flatten().sort().values
             median = ordered[((count - 1).clamp_min(0) // 2)]
-        elif not count:
-            return cls(1.0, 1.0)
-        else:
-            median = view.depth[covered].median()
-        focal_px = (view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]).sqrt()
-        size = (view.mask > 0).sum().clamp_min(1).sqrt() * median / focal_px
-        if torch.compiler.is_exporting():
+            size = _size_m((view.mask > 0).sum(), median, view.camera)
             return cls(*(torch.where(count > 0, value, 1.0) for value in (size, median)))
-        return cls(float(size), float(median))
+        median = torch.where(covered, view.depth, torch.nan).nanmedian()
+        area, median = torch.stack(
+            [(view.mask > 0).sum().double(), median.double()]
+        ).cpu()  # one wait for both
+        if bool(median.isnan()):
+            return cls(1.0, 1.0)
+        return cls(float(_size_m(area.long(), median.float(), view.camera.on_host)), float(median))
+
+
+def _size_m(area_px: Int[Tensor, ""], median_m: Float[Tensor, ""], camera: Cameras) -> Float[Tensor, ""]:
+    """The root of a subject's area at its median depth, metres."""
+    focal_px = (camera.K[0, 0, 0] * camera.K[0, 1, 1]).sqrt()
+    return area_px.clamp_min(1).sqrt() * median_m / focal_px
 
 
 class MipLevels(NamedTuple):
-    """One image per camera, as rows of pixels one after the other; each image has a border of one black pixel."""
+    """Images of each camera, as rows of pixels one after the other; each image has a border of one black pixel.
+
+    `*level` is empty for one image per camera, and "level 1 1" for several levels of a pyramid.
+    """
 
     pixels: Shaped[Tensor, "pixel channel"]
     """0 to 255, or metres."""
-    first: Int[Tensor, "view"]
+    first: Int[Tensor, "*level view"]
     """Index of each image's first pixel."""
-    columns: Int[Tensor, "view"]
+    columns: Int[Tensor, "*level view"]
     """Pixels from one row to the next."""
-    size: Int[Tensor, "view 2"]
+    size: Int[Tensor, "*level view 2"]
     """Rows and columns of each image, with the border."""
-    scale: Float[Tensor, "view"]
+    scale: Float[Tensor, "*level view"]
     """Factor from positions in the camera's image to positions in this one."""
 
     @classmethod
-    def of(cls, pyramids: Sequence["Pyramid"], levels: Sequence[int]) -> "MipLevels":
-        """One level of each pyramid."""
-        images = [pyramid.levels[level] for pyramid, level in zip(pyramids, levels, strict=True)]
+    def of(cls, pyramids: Sequence["Pyramid"], levels: Sequence[Sequence[int]]) -> "MipLevels":
+        """Several levels of each pyramid; `levels` has a row for each of them."""
+        images = [
+            pyramid.levels[level] for own in levels for pyramid, level in zip(pyramids, own, strict=True)
+        ]
         device = images[0].device
+        shape = (len(levels), 1, 1, len(pyramids))
         size = torch.tensor([image.shape[:2] for image in images])
         count = size.prod(1)
-        scale = torch.tensor([0.5**level for level in levels], dtype=torch.double)
+        scale = torch.tensor([0.5**level for own in levels for level in own], dtype=torch.double)
         return cls(
             pixels=torch.cat([image.flatten(0, 1) for image in images]),
-            first=(count.cumsum(0) - count).to(device),
-            columns=size[:, 1].to(device),
-            size=size.to(device),
-            scale=scale.to(device),
+            first=(count.cumsum(0) - count).view(shape).to(device),
+            columns=size[:, 1].view(shape).to(device),
+            size=size.view(*shape, 2).to(device),
+            scale=scale.view(shape).to(device),
+        )
+
+    def at(self, level: int) -> "MipLevels":
+        """One of the levels."""
+        return MipLevels(
+            self.pixels, self.first[level], self.columns[level], self.size[level], self.scale[level]
         )
 
     @classmethod
@@ -101,9 +119,10 @@ class MipLevels(NamedTuple):
         )
 
     def of_cameras(self, index: Int[Tensor, "ray chosen"]) -> "MipLevels":
-        """The levels of the cameras chosen for each ray: fields but `pixels` get the shape [ray, 1, chosen, ...]."""
+        """The levels of the cameras chosen for each ray: the fields get the shape [level, ray, 1, chosen, ...]."""
         at = index[:, None]
-        return MipLevels(self.pixels, self.first[at], self.columns[at], self.size[at], self.scale[at])
+        first, columns, size, scale = (field[:, 0, 0][:, at] for field in self[1:])
+        return MipLevels(self.pixels, first, columns, size, scale)
 
 
 def choose_levels(
@@ -230,19 +249,19 @@ class SourceCameras:
         """Fine and wide level of each source camera, and of each silhouette; see `choose_levels`."""
         found = []
         for cameras, pyramids in self._parts:
-            last = cameras.K.new_tensor([len(pyramid.levels) - 1 for pyramid in pyramids], dtype=torch.long)
-            subject_px = cameras.K.new_tensor([pyramid.subject_px for pyramid in pyramids])
-            levels = choose_levels(cameras, last, subject_px, viewer, step_px, scale)
+            last = torch.tensor([len(pyramid.levels) - 1 for pyramid in pyramids])
+            subject_px = torch.tensor([pyramid.subject_px for pyramid in pyramids])
+            levels = choose_levels(cameras.on_host, last, subject_px, viewer.on_host, step_px, scale)
             found.append(torch.stack(levels, 1).tolist())
         return found
 
-    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
-        """The fine and the wide level of the source cameras, then those of the silhouettes."""
-        found = []
-        for (_, pyramids), levels in zip(self._parts, self.levels(viewer, step_px, scale), strict=True):
-            fine, wide = zip(*levels, strict=True)
-            found += [MipLevels.of(pyramids, fine), MipLevels.of(pyramids, wide)]
-        return found
+    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> tuple[MipLevels, MipLevels]:
+        """The fine and the wide level of the source cameras, and those of the silhouettes."""
+        images, outlines = self.levels(viewer, step_px, scale)
+        return (
+            MipLevels.of(self.pyramids, list(zip(*images, strict=True))),
+            MipLevels.of(self.silhouette_pyramids, list(zip(*outlines, strict=True))),
+        )
 
     def magnification(self, viewer: Cameras, scale: SceneScale) -> float | Float[Tensor, ""]:
         """How many pixels of the novel view a pixel of the sharpest source camera fills along a side, at least 1.

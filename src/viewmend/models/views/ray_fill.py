@@ -231,11 +231,12 @@ def gather_ray_inputs(
     """The network's inputs for pixels (row, column) of a view; `guess` is the view with E filled smoothly, if made."""
     if guess is None:
         guess = fill(view.rgb, view.error > 0, view.mask > 0)
+    scale = SceneScale.of(view)
     if sources is None:
         features = view.depth.new_zeros(len(pixels), len(OFFSETS), 1, sum(CAMERA_CHANNELS))
         smallest = view.depth.new_ones(len(pixels), len(OFFSETS), 4)
     else:
-        samples = sample_behind_proxy(view, pixels, sources)
+        samples = sample_behind_proxy(view, pixels, sources, scale=scale)
         features = samples.features
         smallest = RayStatistics.unstack(samples.statistics).smallest_masks
     image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), (RADIUS_PX,) * 4)
@@ -243,17 +244,23 @@ def gather_ray_inputs(
     rows = pixels[:, 0, None] + reach
     columns = pixels[:, 1, None] + reach
     window = image[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
-    return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels))
+    return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels, scale))
 
 
 def sample_behind_proxy(
-    view: IncompleteView, pixels: Pixels, sources: SourceCameras, offsets: Sequence[float] = OFFSETS
+    view: IncompleteView,
+    pixels: Pixels,
+    sources: SourceCameras,
+    offsets: Sequence[float] = OFFSETS,
+    scale: SceneScale | None = None,
 ) -> RaySamples:
     """`sample_fill_rays` at points `offsets` behind the proxy, on the rays of pixels (row, column).
 
     A pixel without a depth takes it from its surroundings; the view must have a depth somewhere.
+    `scale` is the view's, if it is known.
     """
-    scale = SceneScale.of(view)
+    if scale is None:
+        scale = SceneScale.of(view)
     depth = view.depth[pixels[:, 0], pixels[:, 1]]
     if torch.compiler.is_exporting():
         depth = torch.where(depth > 0, depth, scale.depth_m)
@@ -264,15 +271,17 @@ def sample_behind_proxy(
 
 
 def multi_scale_context(
-    view: IncompleteView, guess: Image, pixels: Pixels
+    view: IncompleteView, guess: Image, pixels: Pixels, scale: SceneScale | None = None
 ) -> tuple[Float[Tensor, "neighbourhood 12 11 11"], Int[Tensor, "pixel"]]:
     """`RayInputs.neighbourhoods` of pixels (row, column), and the index of each pixel's neighbourhood.
 
     Depth is relative: 0.5 at the subject's median, growing with distance, 0 where there is none.
-    Cells meet at the principal point, so that a crop of a view has the same cells.
+    Cells meet at the principal point, so that a crop of a view has the same cells. `scale` is the
+    view's, if it is known.
     """
     # Sums over boxes of the view
-    scale = SceneScale.of(view)
+    if scale is None:
+        scale = SceneScale.of(view)
     depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
     sums = BoxSums.of(torch.cat([guess, view.mask[None], view.error[None], depth[None]])[None])
 

@@ -32,6 +32,9 @@ PATCH = 0.08
 """`RayFill` averages colours over squares of this side, in subject sizes: single pixels agree by chance."""
 MIN_COVERAGE = 0.3
 """`RayFill` measures the distance behind the proxy where at least this share of a pixel is covered by it."""
+CATMULL_ROM = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
+"""Weights of the four values around a position, in a row for each power of the share of the way from
+the second to the third."""
 BAND = 2048
 """A thread takes about this many samples at a time."""
 
@@ -63,16 +66,16 @@ class Rays(NamedTuple):
 
     @property
     def origin(self) -> Float[Tensor, "3"]:
-        """The viewer's position, metres."""
-        return self.view.camera.centers[0].double()
+        """The viewer's position, metres, on the CPU."""
+        return _on_host(self.view.camera).centers[0].double()
 
     @property
     def world_from_pixel(self) -> Float[Tensor, "3 3"]:
-        """R K^-1, from (u, v, 1) to what a pixel's ray gains per metre of z-depth.
+        """R K^-1, from (u, v, 1) to what a pixel's ray gains per metre of z-depth, on the CPU.
 
         K^-1 is written out, because ONNX has no inverse.
         """
-        camera = self.view.camera
+        camera = _on_host(self.view.camera)
         K = camera.K[0].double()
         world_from_camera = camera.camera_from_world[0, :3, :3].double().T
         (fx, skew, cx), (_, fy, cy), _ = K
@@ -88,7 +91,7 @@ class Rays(NamedTuple):
     def directions(self) -> Float[Tensor, "ray 3"]:
         """What each ray gains per metre of z-depth, world coordinates."""
         uv = self.uv_px.double()
-        return torch.cat([uv, torch.ones_like(uv[:, :1])], 1) @ self.world_from_pixel.T
+        return F.pad(uv, (0, 1), value=1.0) @ self.world_from_pixel.T.to(uv.device)
 
 
 class RaySamples(NamedTuple):
@@ -153,8 +156,7 @@ class RayStatistics(NamedTuple):
 class Projections(NamedTuple):
     """Where cameras see samples on rays; zeros where a sample is not in view."""
 
-    u_px: Float[Tensor, "ray sample view"]
-    v_px: Float[Tensor, "ray sample view"]
+    uv_px: Float[Tensor, "ray sample view 2"]
     z_m: Float[Tensor, "ray sample view"]
     """z-depth in the camera."""
     in_view: Bool[Tensor, "ray sample view"]
@@ -202,7 +204,7 @@ def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool 
 
 def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
     """The reference of `sample_rays`."""
-    fine, wide, outline, mean_outline = sources.mips(rays.view.camera, step_px, rays.scale)
+    levels, outlines = sources.mips(rays.view.camera, step_px, rays.scale)
 
     # Positions in the cameras, and distances behind the proxy there
     at = project_rays(rays, sources.cameras)
@@ -214,13 +216,16 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
         at = Projections(*(_of_chosen(values, chosen) for values in at))
         at = at._replace(in_view=at.in_view & (rays.cameras <= last)[:, None])
         behind = _of_chosen(behind, chosen)
-        fine = fine.of_cameras(chosen)
-        wide = wide.of_cameras(chosen)
+        levels = levels.of_cameras(chosen)
 
     # What each camera shows
-    fine_values = sample_level_cubic(fine, at, 4) if cubic else sample_level(fine, at, 4)
-    wide_values = sample_level(wide, at, 5)
-    stacked = _camera_features(rays, sources, at, fine_values, wide_values, behind, F.softsign, chosen)
+    if cubic:
+        fine = sample_level_cubic(levels.at(0), at, 4)
+        wide = sample_level(levels.at(1), at, 5)
+    else:
+        fine, wide = sample_level(levels, at, 5)
+        fine = fine[..., :4]
+    stacked = _camera_features(rays, sources, at, fine, wide, behind, F.softsign, chosen)
     features = CameraFeatures.unstack(stacked)
 
     # Prior weights, and how the cameras differ by them
@@ -233,8 +238,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
 
     # The silhouettes of the whole rig
     at_outline = project_rays(rays, sources.silhouettes.cameras)
-    masks = sample_level(outline, at_outline, 1)
-    smallest = _smallest_masks(at_outline, masks, sample_level(mean_outline, at_outline, 1))
+    smallest = _smallest_masks(at_outline, sample_level(outlines, at_outline, 1)[..., 0])
     statistics = torch.cat([mean, variance, smallest], -1)
     return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
 
@@ -284,18 +288,19 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     behind = torch.where(coverage > MIN_COVERAGE, at.z_m - surface, 0.0) / rays.scale.size_m
 
     # What each camera shows
-    shapes = BoxSums.of(images[:, 3:]).means(at.u_px, at.v_px, shape_side)
+    shapes = BoxSums.of(images[:, 3:]).means(at.uv_px, shape_side)
     half = images[:, :3]
     for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
         half = half.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
-    colours = BoxSums.of(half).means(at.u_px / 2, at.v_px / 2, half_colour_side)
+    colours = BoxSums.of(half).means(at.uv_px / 2, half_colour_side)
     wide = torch.cat([colours, shapes], -1)
     features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
 
     # The silhouettes of the whole rig
     at_outline = project_rays(rays, sources.silhouettes.cameras)
-    mean_outlines = BoxSums.of(masks).means(at_outline.u_px, at_outline.v_px, outline_side)
-    smallest = _smallest_masks(at_outline, sample_level(MipLevels.full(masks), at_outline, 1), mean_outlines)
+    outlines = sample_level(MipLevels.full(masks), at_outline, 1)
+    mean_outlines = BoxSums.of(masks).means(at_outline.uv_px, outline_side)
+    smallest = _smallest_masks(at_outline, torch.stack([outlines[..., 0], mean_outlines[..., 0]]))
     return RaySamples(features, 0 * features[..., 0], F.pad(smallest, (STATISTICS - smallest.shape[-1], 0)))
 
 
@@ -331,7 +336,8 @@ def _distance_behind(rays: Rays, sources: SourceCameras, at: Projections) -> Flo
     depth = sources.views.depth
     rows, columns = depth.shape[1:]
     first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
-    surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
+    column, row = at.uv_px.long().unbind(-1)
+    surface = depth.flatten()[first + row * columns + column].double()
     return torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
 
 
@@ -343,10 +349,13 @@ def _closeness(
 
 
 def _of_chosen(
-    values: Shaped[Tensor, "ray sample camera"], chosen: Int[Tensor, "ray view"]
-) -> Shaped[Tensor, "ray sample view"]:
+    values: Shaped[Tensor, "ray sample camera *channel"], chosen: Int[Tensor, "ray view"]
+) -> Shaped[Tensor, "ray sample view *channel"]:
     """The values of the cameras that were chosen for each ray."""
-    return values.gather(2, chosen[:, None].expand(-1, values.shape[1], -1))
+    index = chosen[:, None].expand(-1, values.shape[1], -1)
+    if values.ndim > index.ndim:
+        index = index[..., None].expand(-1, -1, -1, values.shape[3])
+    return values.gather(2, index)
 
 
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
@@ -373,84 +382,91 @@ def project_lines(
     rays: Rays, cameras: Cameras
 ) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
     """Homogeneous image coordinates of rays in every camera: what they gain per metre of z-depth, and their start."""
+    cameras = _on_host(cameras)
     P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
     linear = P[:, :, :3]
-    return rays.directions @ linear.mT, linear @ rays.origin + P[:, :, 3]
+    start = linear @ rays.origin + P[:, :, 3]
+    directions = rays.directions
+    return directions @ linear.mT.to(directions.device), start.to(directions.device)
 
 
 def project_rays(rays: Rays, cameras: Cameras) -> Projections:
     """Projects every sample into every camera, in double precision."""
     per_metre, start = project_lines(rays, cameras)
     z = rays.z_m.double()[..., None]
-    x, y, w = (per_metre[..., axis].T[:, None] * z + start[:, axis] for axis in range(3))
+    projected = per_metre.movedim(0, 1)[:, None] * z[..., None] + start
+    w = projected[..., 2]
     front = (z > 0) & (w > 1e-6)
-    safe = torch.where(front, w, 1.0)
-    u = x / safe
-    v = y / safe
-    width, height = cameras.size_px.double().unbind(1)
-    in_view = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    uv = projected[..., :2] / torch.where(front, w, 1.0)[..., None]
+    size = _on_host(cameras).size_px.double().to(uv.device)
+    in_view = front & ((uv >= 0) & (uv < size)).all(-1)
     return Projections(
-        u_px=torch.where(in_view, u, 0.0),
-        v_px=torch.where(in_view, v, 0.0),
+        uv_px=torch.where(in_view[..., None], uv, 0.0),
         z_m=torch.where(in_view, w, 0.0),
         in_view=in_view,
     )
 
 
 def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample view"]:
-    """Cosine of the angle at each sample between the viewer and each camera."""
+    """Cosine of the angle at each sample between the viewer and each camera.
+
+    Both look from the sample along b, the ray backwards, and along z b + c, where c is the way from
+    the viewer to the camera. The products b b, b c and c c are the same for all samples of a ray.
+    """
     back = -rays.directions
-    from_viewer = cameras.centers.double() - rays.origin
-    offset = from_viewer + rays.z_m.double()[..., None, None] * back[:, None, None]
-    along = (offset * back[:, None, None]).sum(-1)
-    lengths = (offset.square().sum(-1) * back.square().sum(-1)[:, None, None]).sqrt()
-    return along / lengths.clamp_min(1e-12)
+    z = rays.z_m.double()[..., None]
+    from_viewer = _on_host(cameras).centers.double() - rays.origin
+    b_c = (back @ from_viewer.T.to(back.device))[:, None]
+    b_b = back.square().sum(-1)[:, None, None]
+    c_c = from_viewer.square().sum(-1).to(back.device)
+    along = z * b_b + b_c
+    squared_length = z * (along + b_c) + c_c
+    return along / (squared_length * b_b).clamp_min(1e-24).sqrt()
 
 
 def sample_level(
     levels: MipLevels, at: Projections, channels: int
-) -> Float[Tensor, "ray sample view channel"]:
+) -> Float[Tensor, "*level ray sample view channel"]:
     """The first channels of each camera's image, bilinearly, 255 as 1; meaningless where a sample is not in view."""
-    x = at.u_px * levels.scale + 0.5
-    y = at.v_px * levels.scale + 0.5
-    left = x.floor()
-    top = y.floor()
-    right = (x - left).float()[..., None]
-    below = (y - top).float()[..., None]
-    corner = levels.first + top.long() * levels.columns + left.long()
-    pixels = levels.pixels[:, :channels]
-    upper = (1 - right) * pixels[corner] + right * pixels[corner + 1]
-    lower = (1 - right) * pixels[corner + levels.columns] + right * pixels[corner + levels.columns + 1]
-    return ((1 - below) * upper + below * lower) / 255
+    position = at.uv_px * levels.scale[..., None] + 0.5
+    first = position.floor()
+    share = (position - first).float()
+    column, row = first.long().unbind(-1)
+    corner = levels.first + row * levels.columns + column
+
+    # The four pixels around each position
+    tap = torch.arange(2, device=corner.device)
+    index = corner[..., None, None] + levels.columns[..., None, None] * tap[:, None] + tap
+    across, down = torch.stack([1 - share, share], -1).unbind(-2)
+    weight = down[..., :, None] * across[..., None, :]
+    return (weight[..., None] * levels.pixels[:, :channels][index]).sum((-3, -2)) / 255
 
 
 def sample_level_cubic(
     levels: MipLevels, at: Projections, channels: int
 ) -> Float[Tensor, "ray sample view channel"]:
     """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
-    x = at.u_px * levels.scale + 0.5
-    y = at.v_px * levels.scale + 0.5
-    left = x.floor()
-    top = y.floor()
-    across = _catmull_rom((x - left).float())
-    down = _catmull_rom((y - top).float())
-    pixels = levels.pixels[:, :channels]
-    last_row, last_column = (levels.size - 1).unbind(-1)
-    total = torch.zeros(1, device=x.device)
-    for i in range(4):
-        row = levels.first + torch.minimum((top.long() + i - 1).clamp_min(0), last_row) * levels.columns
-        for j in range(4):
-            column = torch.minimum((left.long() + j - 1).clamp_min(0), last_column)
-            total = total + (down[i] * across[j])[..., None] * pixels[row + column]
+    position = at.uv_px * levels.scale[..., None] + 0.5
+    first = position.floor()
+    share = (position - first).float()
+
+    # The sixteen pixels around each position, or those at the border
+    tap = torch.arange(-1, 3, device=share.device)
+    last = (levels.size - 1).flip(-1)[..., None]
+    place = (first.long()[..., None] + tap).clamp_min(0)
+    column, row = torch.minimum(place, last).unbind(-2)
+    index = (levels.first[..., None] + row * levels.columns[..., None])[..., None] + column[..., None, :]
+    squared = share * share
+    powers = torch.stack([torch.ones_like(share), share, squared, squared * share], -1)
+    across, down = (powers @ share.new_tensor(CATMULL_ROM)).unbind(-2)
+    weight = down[..., :, None] * across[..., None, :]
+    total = (weight[..., None] * levels.pixels[:, :channels][index]).sum((-3, -2))
     return (total / 255).clamp(0, 1)
 
 
-def _catmull_rom(t: Float[Tensor, "*any"]) -> tuple[Float[Tensor, "*any"], ...]:
-    """Weights of the four values around a position `t` of the way from the second to the third."""
-    a = t * (t * (1 - 0.5 * t) - 0.5)
-    d = 0.5 * t * t * (t - 1)
-    b = t * t * (1.5 * t - 2.5) + 1
-    return a, b, 1 - a - b - d, d
+def _on_host(cameras: Cameras) -> Cameras:
+    """The cameras on the CPU, where numbers of single cameras are computed; themselves while `torch.export` traces."""
+    return cameras if cameras.K.device.type == "cpu" else cameras.on_host
 
 
 def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
@@ -468,16 +484,15 @@ def _box_sides(
 
 
 def _smallest_masks(
-    at: Projections, mask: Float[Tensor, "ray sample view 1"], mean: Float[Tensor, "ray sample view 1"]
+    at: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
 ) -> Float[Tensor, "ray sample 4"]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
-    found = []
-    for values in (mask[..., 0], mean[..., 0]):  # ONNX has no `topk` of an unknown number of cameras
-        seen = torch.where(at.in_view, values, 1.0)
-        first = seen.argmin(-1, keepdim=True)
-        others = torch.where(torch.arange(seen.shape[-1], device=seen.device) == first, 1.0, seen)
-        found += [seen.amin(-1), others.amin(-1)]
-    return torch.stack(found, -1)
+    # ONNX has no `topk` of an unknown number of cameras
+    seen = torch.where(at.in_view, masks, 1.0)
+    first = seen.argmin(-1, keepdim=True)
+    others = torch.where(torch.arange(seen.shape[-1], device=seen.device) == first, 1.0, seen)
+    of_masks, of_means = torch.stack([seen.amin(-1), others.amin(-1)], -1)
+    return torch.cat([of_masks, of_means], -1)
 
 
 def _sample_numba(
