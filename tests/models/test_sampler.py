@@ -82,7 +82,7 @@ def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
 def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
     _, view, sources = scene
     rays = rays_of(view)
-    rays = rays._replace(z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
+    rays = replace(rays, z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
     given = rays, sources, step_px
     fast, slow = sample_rays(*given, cubic=cubic), sample_rays_torch(*given, cubic=cubic)
     levels = sources.levels(view.camera, step_px, SceneScale.of(view))
@@ -225,14 +225,14 @@ def test_rays_are_sampled_in_their_own_cameras_only(scene, kernels, cubic):
     rays = rays_of(view)
     chosen = some_cameras(rays, len(sources.cameras), 2)
     everything = sample(rays, sources, 2.0, cubic)
-    found = sample(rays._replace(cameras=chosen), sources, 2.0, cubic)
+    found = sample(replace(rays, cameras=chosen), sources, 2.0, cubic)
     index = chosen[:, None, :, None].expand(-1, len(OFFSETS), -1, sum(CAMERA_CHANNELS))
     features = everything.features[..., : sum(CAMERA_CHANNELS)].gather(2, index)
     torch.testing.assert_close(found.features[..., : sum(CAMERA_CHANNELS)], features, atol=1e-6, rtol=0)
     torch.testing.assert_close(found.statistics[..., 6:], everything.statistics[..., 6:], atol=1e-6, rtol=0)
     seen = found.features[..., IN_VIEW].amax(2)
     torch.testing.assert_close(found.prior.sum(2), seen, atol=1e-3, rtol=0)
-    parts = [sample(part, sources, 2.0, cubic) for part in rays._replace(cameras=chosen).split(700)]
+    parts = [sample(part, sources, 2.0, cubic) for part in replace(rays, cameras=chosen).split(700)]
     assert torch.equal(torch.cat([part.features for part in parts]), found.features)
 
 
@@ -241,8 +241,8 @@ def test_a_camera_that_does_not_exist_sees_nothing(scene):
     rays = rays_of(view)
     chosen = some_cameras(rays, len(sources.cameras), 2)
     absent = torch.cat([chosen, torch.full_like(chosen[:, :1], len(sources.cameras))], 1)
-    wanted = sample_rays_torch(rays._replace(cameras=chosen), sources, 2.0)
-    found = sample_rays_torch(rays._replace(cameras=absent), sources, 2.0)
+    wanted = sample_rays_torch(replace(rays, cameras=chosen), sources, 2.0)
+    found = sample_rays_torch(replace(rays, cameras=absent), sources, 2.0)
     assert torch.equal(found.statistics, wanted.statistics) and not bool(found.features[:, :, 2].any())
 
 

@@ -202,6 +202,11 @@ class PackedSources(SourceCameras):
         views = ContextViews(MultiViewFrame(cameras, images, masks, 0), depth)
         return cls(views, (), Silhouettes(inputs.masks, Cameras((), *tensors)), (), inputs.is_source)
 
+    @property
+    def mask_sums(self) -> tuple[Int[Tensor, "view"], Int[Tensor, "silhouette"]]:
+        """`SourceCameras.mask_sums`, of the inputs."""
+        return self.images[:, 3].sum((1, 2)), self.silhouettes.mask.sum((1, 2))
+
     def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
         """Which cameras coloured the view: an input here, since cameras have no names."""
         return self.coloured

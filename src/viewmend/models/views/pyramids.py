@@ -88,12 +88,13 @@ class MipLevels(NamedTuple):
         shape = (len(levels), 1, 1, len(pyramids))
         size = torch.tensor([image.shape[:2] for image in images])
         count = size.prod(1)
+        first_and_size = torch.cat([(count.cumsum(0) - count)[None], size.T]).view(3, *shape).to(device)
         scale = torch.tensor([0.5**level for own in levels for level in own], dtype=torch.double)
         return cls(
             pixels=torch.cat([image.flatten(0, 1) for image in images]),
-            first=(count.cumsum(0) - count).view(shape).to(device),
-            columns=size[:, 1].view(shape).to(device),
-            size=size.view(*shape, 2).to(device),
+            first=first_and_size[0],
+            columns=first_and_size[2],
+            size=first_and_size[1:].movedim(0, -1),
             scale=scale.view(shape).to(device),
         )
 
@@ -170,6 +171,8 @@ class Pyramid:
     levels: tuple[UInt8[Tensor, "_rows _columns channel"], ...]
     subject_px: float
     """Root of the subject's area."""
+    mask_sum: int
+    """Sum of the mask, 0 to 255, over all pixels."""
 
 
 @dataclass(frozen=True)
@@ -238,6 +241,12 @@ class SourceCameras:
     def images(self) -> UInt8[Tensor, "view 5 height width"]:
         """RGB on black, mask and coverage by the proxy, of each source camera."""
         return source_images(self.views.frame.rgb, _masks(self.views), self.views.depth)
+
+    @property
+    def mask_sums(self) -> tuple[Int[Tensor, "view"], Int[Tensor, "silhouette"]]:
+        """Sum of each source camera's mask, 0 to 255, over all pixels, and of each silhouette; on the CPU."""
+        of_views = torch.tensor([pyramid.mask_sum for pyramid in self.pyramids])
+        return of_views, torch.tensor([pyramid.mask_sum for pyramid in self.silhouette_pyramids])
 
     def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
         """Which source cameras have one of these names."""
@@ -350,8 +359,10 @@ def _pyramids(cameras: Cameras, base: Callable[[int, int, int], Tensor], mask: i
         while min(levels[-1].shape[:2]) - 2 > SMALLEST_PX:
             levels.append(downsample2x(levels[-1]))
         level = min(AREA_LEVEL, len(levels) - 1)
-        area_px = float(levels[level][..., mask].sum(dtype=torch.long)) / 255 * 4**level
-        made[view] = Pyramid(tuple(levels), max(1.0, math.sqrt(area_px)))
+        sums = torch.stack([levels[at][..., mask].sum(dtype=torch.long) for at in (0, level)])
+        mask_sum, coarse_sum = sums.tolist()
+        area_px = coarse_sum / 255 * 4**level
+        made[view] = Pyramid(tuple(levels), max(1.0, math.sqrt(area_px)), mask_sum)
 
     parallel_for(work, len(sizes))
     return tuple(made[view] for view in range(len(sizes)))

@@ -7,6 +7,8 @@ kernels replace it (`_sampler_numba.py`).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +17,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.threads import parallel_for
 from viewmend.models.views.box_sums import BoxSums
 from viewmend.models.views.config import AROUND, CONTRAST, FAR, FEATURES, NEAR, STATISTICS
@@ -39,7 +41,8 @@ BAND = 2048
 """A thread takes about this many samples at a time."""
 
 
-class Rays(NamedTuple):
+@dataclass(frozen=True)
+class Rays:
     """Rays of a novel view, and sample positions on them."""
 
     view: IncompleteView
@@ -61,7 +64,7 @@ class Rays(NamedTuple):
         for first in range(0, max(1, len(self.uv_px)), size):
             own = slice(first, first + size)
             cameras = None if self.cameras is None else self.cameras[own]
-            parts.append(self._replace(uv_px=self.uv_px[own], z_m=self.z_m[own], cameras=cameras))
+            parts.append(replace(self, uv_px=self.uv_px[own], z_m=self.z_m[own], cameras=cameras))
         return parts
 
     @property
@@ -87,7 +90,7 @@ class Rays(NamedTuple):
         ]
         return world_from_camera @ torch.stack(inverse)
 
-    @property
+    @cached_property
     def directions(self) -> Float[Tensor, "ray 3"]:
         """What each ray gains per metre of z-depth, world coordinates."""
         uv = self.uv_px.double()
@@ -207,7 +210,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     levels, outlines = sources.mips(rays.view.camera, step_px, rays.scale)
 
     # Positions in the cameras, and distances behind the proxy there
-    at = project_rays(rays, sources.cameras)
+    at, at_outline = _project_into_all(rays, sources)
     behind = _distance_behind(rays, sources, at)
     chosen = None
     if rays.cameras is not None:
@@ -237,7 +240,6 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     difference = features.in_view * (features.colour - mean[:, :, None])
 
     # The silhouettes of the whole rig
-    at_outline = project_rays(rays, sources.silhouettes.cameras)
     smallest = _smallest_masks(at_outline, sample_level(outlines, at_outline, 1)[..., 0])
     statistics = torch.cat([mean, variance, smallest], -1)
     return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
@@ -249,9 +251,7 @@ def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
         return _sample_fill_rays_torch(rays, sources)
     images = [pyramid.levels[0] for pyramid in sources.pyramids]
     masks = [pyramid.levels[0] for pyramid in sources.silhouette_pyramids]
-    mask_sums = torch.tensor([int(image[..., 3].sum(dtype=torch.long)) for image in images])
-    outline_sums = torch.tensor([int(mask.sum(dtype=torch.long)) for mask in masks])
-    shape_side, half_colour_side, outline_side = map(int, _box_sides(mask_sums, outline_sums))
+    shape_side, half_colour_side, outline_side = map(int, _box_sides(*sources.mask_sums))
 
     # Means of all cameras over boxes: colours of every second pixel, shapes, outlines
     boxes = [_Boxes(image, first=0, channels=3, step=2, side=half_colour_side) for image in images]
@@ -278,10 +278,10 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     images = sources.images
     depth = sources.views.depth[:, None]
     masks = sources.silhouettes.mask[:, None]
-    shape_side, half_colour_side, outline_side = _box_sides(images[:, 3].sum((1, 2)), masks.sum((1, 2, 3)))
+    shape_side, half_colour_side, outline_side = _box_sides(*sources.mask_sums)
 
     # Distance behind the proxy: the mean depth of the pixels around that have one
-    at = project_rays(rays, sources.cameras)
+    at, at_outline = _project_into_all(rays, sources)
     fine = sample_level(MipLevels.full(images), at, 5)
     coverage = fine[..., 4]
     surface = 255 * sample_level(MipLevels.full(depth), at, 1)[..., 0] / coverage.clamp_min(MIN_COVERAGE)
@@ -297,7 +297,6 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
 
     # The silhouettes of the whole rig
-    at_outline = project_rays(rays, sources.silhouettes.cameras)
     outlines = sample_level(MipLevels.full(masks), at_outline, 1)
     mean_outlines = BoxSums.of(masks).means(at_outline.uv_px, outline_side)
     smallest = _smallest_masks(at_outline, torch.stack([outlines[..., 0], mean_outlines[..., 0]]))
@@ -315,19 +314,14 @@ def _camera_features(
     chosen: Int[Tensor, "ray view"] | None = None,
 ) -> Float[Tensor, "ray sample view 14"]:
     """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
-    cosines = viewing_cosines(rays, sources.cameras)
-    is_source = sources.is_source(rays.view.source_views).expand_as(cosines)
+    cosines = viewing_cosines(rays, sources.cameras).float()
+    is_source = sources.is_source(rays.view.source_views).float().expand_as(cosines)
     if chosen is not None:
         cosines = _of_chosen(cosines, chosen)
         is_source = _of_chosen(is_source, chosen)
-    single_channels = [
-        squash(behind / NEAR),
-        squash(behind / FAR),
-        cosines,
-        is_source,
-        torch.ones_like(behind),
-    ]
-    features = torch.cat([fine, torch.stack([channel.float() for channel in single_channels], -1), wide], -1)
+    differences = squash(behind[..., None] / behind.new_tensor([NEAR, FAR])).float()
+    single_channels = torch.stack([cosines, is_source, at.in_view.float()], -1)
+    features = torch.cat([fine, differences, single_channels, wide], -1)
     return torch.where(at.in_view[..., None], features, 0.0)
 
 
@@ -387,7 +381,10 @@ def project_lines(
     linear = P[:, :, :3]
     start = linear @ rays.origin + P[:, :, 3]
     directions = rays.directions
-    return directions @ linear.mT.to(directions.device), start.to(directions.device)
+    if directions.device.type == "cpu":
+        return directions @ linear.mT, start
+    linear_and_start = torch.cat([linear, start[..., None]], -1).to(directions.device)  # in one copy
+    return directions @ linear_and_start[..., :3].mT, linear_and_start[..., 3]
 
 
 def project_rays(rays: Rays, cameras: Cameras) -> Projections:
@@ -407,6 +404,18 @@ def project_rays(rays: Rays, cameras: Cameras) -> Projections:
     )
 
 
+def _project_into_all(rays: Rays, sources: SourceCameras) -> tuple[Projections, Projections]:
+    """Projections into the source cameras, and into those of the silhouettes."""
+    parts = sources.cameras, sources.silhouettes.cameras
+    if torch.compiler.is_exporting():  # which cannot split a number of cameras that it does not know
+        images, outlines = parts
+        return project_rays(rays, images), project_rays(rays, outlines)
+    together = project_rays(rays, concatenate_cameras([_on_host(part) for part in parts]))
+    counts = [part.K.shape[0] for part in parts]
+    of_images, of_outlines = zip(*(values.split(counts, 2) for values in together), strict=True)
+    return Projections(*of_images), Projections(*of_outlines)
+
+
 def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample view"]:
     """Cosine of the angle at each sample between the viewer and each camera.
 
@@ -416,9 +425,10 @@ def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample v
     back = -rays.directions
     z = rays.z_m.double()[..., None]
     from_viewer = _on_host(cameras).centers.double() - rays.origin
-    b_c = (back @ from_viewer.T.to(back.device))[:, None]
+    c_and_square = torch.cat([from_viewer, from_viewer.square().sum(-1, keepdim=True)], 1).to(back.device)
+    b_c = (back @ c_and_square[:, :3].T)[:, None]
     b_b = back.square().sum(-1)[:, None, None]
-    c_c = from_viewer.square().sum(-1).to(back.device)
+    c_c = c_and_square[:, 3]
     along = z * b_b + b_c
     squared_length = z * (along + b_c) + c_c
     return along / (squared_length * b_b).clamp_min(1e-24).sqrt()
