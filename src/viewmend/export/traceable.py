@@ -226,7 +226,7 @@ class PackedSources(SourceCameras):
 
     def magnification(self, viewer: Cameras, scale: SceneScale) -> Float[Tensor, ""]:
         """`SourceCameras.magnification` as a tensor, on which the sides of the bands of detail depend."""
-        largest = pixel_footprints(self.cameras, viewer, scale).amax()
+        largest = pixel_footprints(self.cameras, viewer, scale).amax(0)  # ONNX needs the axis
         return (1 / largest.clamp_min(1e-6)).clamp_min(1)
 
 
