@@ -202,6 +202,7 @@ def test_other_settings_are_other_cells(small_scenes):
         {"precision": "bfloat16"},
         {"background": "white"},
         {"protocol": "target-mask"},
+        {"top_k": 64},
     ):
         assert cell_keys(small_scenes[0], {"telea": "x"}, RunSettings(**other)) != usual
     assert cell_keys(small_scenes[0], {"telea": "y"}, RunSettings()) != usual

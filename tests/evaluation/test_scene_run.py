@@ -229,3 +229,18 @@ def test_a_predicted_mask_is_given_to_all_methods(small_scenes, scored):
     truth = scored[0][1].mask
     overlap = ((masks[0] > 0.5) & truth).sum() / ((masks[0] > 0.5) | truth).sum()
     assert float(overlap) > 0.8
+
+
+def test_the_number_of_kept_tokens_reaches_the_model(small_scenes):
+    class Asked(Telea):
+        top_k: ClassVar[list[int | None]] = []
+
+        def step(self, view, context, state):
+            self.top_k.append(context.quality.top_k)
+            return super().step(view, context, state)
+
+    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=1))
+    for top_k in (None, 64):
+        Asked.top_k.clear()
+        run = evaluate_scene(scene, ("asked",), RunSettings(top_k=top_k), {"asked": Asked()})
+        assert run.runs[0].error is None and set(Asked.top_k) == {top_k}

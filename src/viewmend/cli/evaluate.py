@@ -89,6 +89,8 @@ class RunOptions:
     precision: Precision = "auto"
     """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
     for it, and always the same on a machine."""
+    top_k: int | None = None
+    """Number of context tokens that the paper's model keeps when pruning; by default the model's own."""
     shown: int = 12
     """Scenes of each set with images in report.html; sheets/ has all of them."""
 
@@ -162,7 +164,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     Raises:
         ValueError: an option is not valid.
     """
-    check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1)
+    check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1, top_k=1)
     if not sets:
         raise ValueError("expected at least one set, got no set; P needs no data")
     if options.out.exists() and not options.out.is_dir():
@@ -185,7 +187,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     names = method_names(methods)
     available, missing = split_missing(names, options.device)
     networks, missing_networks = available_networks()
-    same = {name: getattr(options, name) for name in ("device", "precision", "ssim", "protocol")}
+    same = {name: getattr(options, name) for name in ("device", "precision", "ssim", "protocol", "top_k")}
     stream = StreamConfig(geometry=options.geometry, render=options.view.config(), memory_mb=None)
     settings = RunSettings(stream=stream, background=options.score_background, networks=networks, **same)
     if missing or missing_networks:

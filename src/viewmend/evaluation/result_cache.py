@@ -175,8 +175,11 @@ def cell_keys(
         error_rule(settings.stream.render.error_rule or "holes").__module__
     ]  # has the hash of a user's file
     scene_digest = _digest([*rules, *settings.networks])
+    of_methods = [settings.precision]
+    if settings.top_k is not None:
+        of_methods.append(f"top_k {settings.top_k}")
     return tuple(
-        CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)
+        CellKey(scene.name, name, _digest([scene_digest, own, *of_methods]), scene_digest)
         for name, own in identities.items()
     )
 

@@ -19,7 +19,7 @@ from viewmend.evaluation.scores import (
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.metrics.image_quality import SsimWindow
-from viewmend.models.base import Inpainter
+from viewmend.models.base import Inpainter, RenderQuality
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.models.registry import MASK_MODEL, error_model_for, make_method
@@ -49,6 +49,8 @@ class RunSettings:
     """Networks of metrics (`scores.NETWORKS`) to use."""
     protocol: Protocol = "strict"
     """What is known of the mask of the held-out camera."""
+    top_k: int | None = None
+    """Context tokens that the paper's model keeps when pruning; None for the model's own number."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,8 @@ class _MethodStream:
         error_model = error_model_for(inpainter, settings.device) if predicted else None
         # The geometry comes with the frames, which all methods share.
         config = replace(settings.stream, geometry="hull", background=settings.background)
-        sequence = ViewSequence(inpainter, config, bounds, error_model=error_model)
+        quality = RenderQuality(top_k=settings.top_k)
+        sequence = ViewSequence(inpainter, config, bounds, quality=quality, error_model=error_model)
         sequence.first_twice = new
         return sequence
 
