@@ -89,11 +89,15 @@ class Running:
 
 
 @contextlib.contextmanager
-def running(source=None, inpainter=None, ready=True, now=time.monotonic, **config) -> Iterator[Running]:
+def running(
+    source=None, inpainter=None, ready=True, now=time.monotonic, completed_cameras=0, **config
+) -> Iterator[Running]:
     """A server on a free port, stopped at the end."""
     source = source or RecordedSource(lambda: BallCapture(CAMERAS, 3))
     settings = ServerConfig(**({"port": 0, "budget_ms": None} | config))
-    service = RenderService(Renderer(source, inpainter or SmoothFill(), PIPELINE), source, now)
+    model = inpainter or SmoothFill()
+    renderer = Renderer(source, model, PIPELINE, completed_cameras=completed_cameras)
+    service = RenderService(renderer, source, now)
     live = LiveServer(service, settings)
     server = Server(live, settings)
     with server.bind() as url:

@@ -107,6 +107,7 @@ def run(options: Options) -> int:
     if options.ray is not None:
         _serve_on_ray(options, options.ray)
     from viewmend.cli.console import say
+    from viewmend.completed_cameras import MAX_COMPLETED
     from viewmend.live.listener import Server
     from viewmend.live.protocol import token_query
     from viewmend.live.renderer import Renderer
@@ -130,6 +131,7 @@ def run(options: Options) -> int:
         errors,
         draws_in_page=in_page,
         precision=options.precision,
+        completed_cameras=MAX_COMPLETED,
     )
     live = LiveServer(RenderService(renderer, source), config)
     server = Server(live, config)

@@ -17,7 +17,7 @@ import asyncio
 import time
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -69,8 +69,13 @@ COMPLETED_VIEW_POWER = 128
 """The exponent of the cosine between the directions to camera and viewer, where some cameras are
 completed views: they stand closer to each other than real cameras."""
 Names = tuple[str, ...]
-Key = tuple[int, Names]
+FrameKey = tuple[int, Names]
 """A frame, and the cameras that are left out."""
+
+
+def frame_key(index: int, without: Sequence[str]) -> FrameKey:
+    """The key of a frame without some cameras, whatever their order."""
+    return index, tuple(sorted(without))
 
 
 class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -113,6 +118,15 @@ class FrameAssets:
         return len(self.shape.content) + sum(len(image.content) for image in self.images)
 
 
+@dataclass(frozen=True)
+class CompletedImage:
+    """A view that a model completed, as a further source image of a frame."""
+
+    camera: dict[str, Any]
+    """The virtual camera in the protocol's form, with its `number` among the frame's assets."""
+    asset: Asset
+
+
 class BusyError(Exception):
     """Too many frames are being prepared."""
 
@@ -130,8 +144,8 @@ class AssetStore:
         self._read = read
         self._make = make
         self._max_bytes = 1e6 * memory_mb
-        self._kept: OrderedDict[Key, FrameAssets] = OrderedDict()
-        self._making: dict[Key, asyncio.Task[FrameAssets]] = {}
+        self._kept: OrderedDict[FrameKey, FrameAssets] = OrderedDict()
+        self._making: dict[FrameKey, asyncio.Task[FrameAssets]] = {}
         self._turn = asyncio.Lock()
         self._version: str | None = None
         self.size_bytes = 0
@@ -167,7 +181,7 @@ class AssetStore:
             )  # its waiters may have left
         return await asyncio.shield(task)
 
-    async def _prepare(self, key: Key, version: str) -> FrameAssets:
+    async def _prepare(self, key: FrameKey, version: str) -> FrameAssets:
         try:
             frame = await wait_for_frame(self._read, key[0], READ_S)
             async with self._turn:
@@ -213,8 +227,8 @@ def make_assets(
     """
     cameras, images = _image_assets(frame, jpeg_quality)
     if completed is not None:
-        more_cameras, more_images = _image_assets(completed, jpeg_quality)
-        cameras += [camera | {"completed": True} for camera in more_cameras]
+        more_cameras, more_images = completed_assets(completed, jpeg_quality)
+        cameras += more_cameras
         images += more_images
     arrays = _shape_arrays(frame, proxy)
     vertices = proxy.mesh.vertices
@@ -241,6 +255,19 @@ def make_assets(
     }
     shape = Asset(pack(header, list(packed.values())), "application/octet-stream")
     return FrameAssets(shape, tuple(images))
+
+
+def completed_assets(
+    completed: MultiViewFrame, jpeg_quality: int = JPEG_QUALITY
+) -> tuple[list[dict[str, Any]], list[Asset]]:
+    """Completed views as further source images, and their cameras in the protocol's form.
+
+    Args:
+        completed: straight colours, and alpha as masks.
+        jpeg_quality: quality of the images, up to 100.
+    """
+    cameras, images = _image_assets(completed, jpeg_quality)
+    return [camera | {"completed": True} for camera in cameras], images
 
 
 def _image_assets(frame: MultiViewFrame, jpeg_quality: int) -> tuple[list[dict[str, Any]], list[Asset]]:

@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.live import protocol
+from viewmend.live.assets import FrameKey
 from viewmend.live.auth import RateLimit
 from viewmend.live.protocol import Ack, Cancel, ClockChange, Hello, Look, Message, Ping, ProtocolError
 from viewmend.live.registry import SessionRegistry, SharedState
@@ -74,6 +75,10 @@ class SentMessages:
     """The time of the last message `stats`."""
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
+    completed: int = 0
+    """The number of views that were completed ahead when messages `completed` were last sent."""
+    completed_of: dict[FrameKey, int] = field(default_factory=dict)
+    """The number of completed views of each frame in the last message `completed` about it."""
 
 
 class ViewerConnection:
@@ -87,7 +92,7 @@ class ViewerConnection:
         self._loop = asyncio.get_running_loop()
         self._wake_writer = asyncio.Event()
         self._pending: dict[str, dict[str, Any]] = {}
-        """Messages that wait for the writer, by type."""
+        """Messages that wait for the writer, by name."""
         self._frame: bytes | None = None
         """The frame that waits for the writer."""
         messages_per_s = registry.limits.messages_per_s
@@ -267,6 +272,9 @@ class ViewerConnection:
             self._sent.show = shared.show
             self._send_soon(shared.show)
         self._send_statistics(shared.viewers)
+        if shared.completed != self._sent.completed:
+            self._sent.completed = shared.completed
+            self._send_completed()
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
 
@@ -295,6 +303,17 @@ class ViewerConnection:
             self._sent.state_s = now
             self._send_soon({"type": "state"} | causes.shared.source | own)
 
+    def _send_completed(self) -> None:
+        """Say which completed views there are of each frame that has more, or others, than it had."""
+        counts = self._service.ahead.counts()
+        for key, count in counts.items():
+            if self._sent.completed_of.get(key) != count:
+                index, without = key
+                cameras = [image.camera for image in self._service.ahead.images(key)]
+                message = {"type": "completed", "time": index, "without": without, "cameras": cameras}
+                self._send_soon(message, f"completed {key}")
+        self._sent.completed_of = counts
+
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
@@ -310,9 +329,9 @@ class ViewerConnection:
             self._sent.rig = rig
             self._send_soon({"type": "rig"} | rig)
 
-    def _send_soon(self, message: dict[str, Any]) -> None:
-        """Queue a message; it replaces one of the same type that is still waiting."""
-        self._pending[message["type"]] = message
+    def _send_soon(self, message: dict[str, Any], name: str | None = None) -> None:
+        """Queue a message; it replaces one of the same name, by default its type, that is still waiting."""
+        self._pending[name or message["type"]] = message
         self._wake_writer.set()
 
     def _send_frame(self, message: bytes) -> None:

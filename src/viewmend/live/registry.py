@@ -31,6 +31,8 @@ class SharedState:
     """The message `rig`; None before the first frame."""
     viewers: int
     """The number of connected viewers."""
+    completed: int
+    """The number of views that were completed ahead so far."""
 
 
 @runtime_checkable
@@ -107,7 +109,14 @@ class SessionRegistry:
 
     def shared_state(self) -> SharedState:
         """What is the same for all viewers now."""
-        return SharedState(self.source_json(), self.shown, self.service.renderer.rig_json, len(self.sessions))
+        service = self.service
+        return SharedState(
+            self.source_json(),
+            self.shown,
+            service.renderer.rig_json,
+            len(self.sessions),
+            service.ahead.changes,
+        )
 
     def source_json(self) -> dict[str, Any]:
         """The shared fields of the message `state`."""

@@ -13,11 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.completed_cameras import complete_views, place_around, with_finer_images
 from viewmend.frame_cache import CachedFrame, cache_frame
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.live.assets import FrameAssets, make_assets
+from viewmend.live.assets import CompletedImage, FrameAssets, completed_assets, make_assets
 from viewmend.live.budget import ladder_for
 from viewmend.live.frame_source import FrameSource, RigInfo
 from viewmend.live.poses import HomeView, home_view, rig_json, view_camera
@@ -104,6 +105,7 @@ class Renderer:
         error_model: Inpainter | None = None,
         draws_in_page: bool = True,
         precision: str = "auto",
+        completed_cameras: int = 0,
     ) -> None:
         """Set up the renderer.
 
@@ -115,6 +117,8 @@ class Renderer:
             error_model: as in `Stream`.
             draws_in_page: whether pages draw moving views by themselves.
             precision: number format of models that viewers compare, as in `load_inpainter`.
+            completed_cameras: number of virtual cameras around the subject whose views are completed
+                ahead, for the frames that pages draw (`completed_ahead.py`).
         """
         self._source = source
         self._inpainter = inpainter
@@ -124,6 +128,7 @@ class Renderer:
         self._device = device
         self._precision = precision
         self._draws_in_page = draws_in_page
+        self._completed_cameras = completed_cameras if draws_in_page else 0
         self._rig: RigInfo | None = None
         self._stream: Stream | None = None
         self._variants: OrderedDict[tuple[str | None, tuple[str, ...]], Stream] = OrderedDict()
@@ -132,6 +137,8 @@ class Renderer:
         """Other models, loaded on demand."""
         self.home: HomeView | None = None
         """The initial view; None before the first frame."""
+        self.virtual_cameras: Cameras | None = None
+        """The cameras around the subject whose views are completed ahead; None if none are."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
         self.assets_version: str | None = None
@@ -178,6 +185,9 @@ class Renderer:
         fps = self._source.span.fps or None
         self.rig_json = rig_json(rig.name, cameras, bounds or proxy.bounds, home, fps, version)
         self._variants.clear()
+        if self._completed_cameras:
+            around = place_around(cameras.to("cpu"), home.center, rig.up, self._completed_cameras)
+            self.virtual_cameras = with_finer_images(around)
         self._rig = rig
         self._stream = stream
         self.home = home
@@ -277,6 +287,15 @@ class Renderer:
         proxy = cached.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         return proxy.to("cpu")
+
+    def complete_virtual_camera(self, index: int, without: tuple[str, ...], number: int) -> CompletedImage:
+        """The view of a virtual camera, as a further source image of a frame; errors as `render`."""
+        assert self.virtual_cameras is not None, "a rig was prepared, whose views are completed ahead"
+        left_out = self.left_out(without)
+        stream = self._stream_of(None, left_out)
+        cached = self._add_frame(stream, index, left_out)
+        cameras, images = completed_assets(complete_views(stream, cached, self.virtual_cameras[[number]]))
+        return CompletedImage(cameras[0] | {"number": len(cached.frame.cameras) + number}, images[0])
 
     def _stream_of(self, model: str | None, without: tuple[str, ...]) -> Stream:
         """The stream of a model, None for the renderer's own, that uses all but some cameras."""

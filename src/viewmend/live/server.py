@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from viewmend import __version__
 from viewmend.geometry.orbit import coarse_surface
 from viewmend.live import render_jobs, responses
-from viewmend.live.assets import NOT_IN_TIME, AssetQuery, AssetStore, BusyError, wait_for_frame
+from viewmend.live.assets import NOT_IN_TIME, AssetQuery, AssetStore, BusyError, frame_key, wait_for_frame
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import ViewerConnection
 from viewmend.live.connection_limits import authenticate
@@ -278,13 +278,22 @@ class LiveServer:
         try:
             without = self._service.renderer.left_out(asked.without.split(","))
             made = await self.assets.get(asked.time, version, without)
+            key = frame_key(asked.time, without)
+            self._service.ahead.note_drawn(key)
         except ValueError as error:
             return error_response(404, f"this frame cannot be drawn: {error}"[:400])
-        if asked.camera is not None and asked.camera >= len(made.images):
+        if asked.camera is None:
+            asset = made.shape
+        elif asked.camera < len(made.images):
+            asset = made.images[asked.camera]
+        else:
+            asset = self._service.ahead.image(key, asked.camera)
+        if asset is None:
             return error_response(
-                404, f"expected a camera from 0 to {len(made.images) - 1}, got {asked.camera}"
+                404,
+                f"expected a camera from 0 to {len(made.images) - 1}, or a completed view that was made, got "
+                f"{asked.camera}",
             )
-        asset = made.shape if asked.camera is None else made.images[asked.camera]
         return asset_response(request, asset, is_final=asked.v == version)
 
     async def _progress(self, request: Request) -> Response:

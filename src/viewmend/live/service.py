@@ -8,12 +8,13 @@ from collections.abc import Callable
 from typing import Any
 
 from viewmend.live.budget import ResolutionLimit
+from viewmend.live.completed_ahead import CompletedAhead
 from viewmend.live.frame_source import FrameSource, Span
 from viewmend.live.poses import HomeView
 from viewmend.live.protocol import FrameTimes
 from viewmend.live.render_jobs import RenderJob
 from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
-from viewmend.live.sessions import PlaybackState, ViewerSession
+from viewmend.live.sessions import PlaybackState, ShownFrame, ViewerSession
 from viewmend.utils.cancellation import CancelledError, cancellable
 from viewmend.utils.heap import HeapTrimmer
 
@@ -46,6 +47,8 @@ class RenderService:
         """Called, on any thread, when the source has changed."""
         self.error: str | None = None
         """The error of the last view, or of the rig's first frame."""
+        self.ahead = CompletedAhead(renderer)
+        """Completed virtual cameras of the frames that pages draw."""
         self.counts = Counter(frames=0, shared=0, errors=0, cancelled=0)
         self.times = FrameTimes()
         """Times of all frames together; like the counts, for /metrics."""
@@ -110,7 +113,7 @@ class RenderService:
         trimmer = HeapTrimmer()
         while not self._stopped:
             try:
-                worked = self._prepare() or self.serve_next()
+                worked = self._prepare() or self.serve_next() or self.complete_ahead()
             except Exception as error:  # the thread goes on
                 log.warning("while preparing: %s", error)
                 self.error = f"{type(error).__name__}: {error}"[:400]
@@ -165,6 +168,46 @@ class RenderService:
         self.counts.update(frames=1, shared=int(times.geometry == 0))
         self.times += times
         return True
+
+    def complete_ahead(self) -> bool:
+        """Complete one virtual camera of a frame that is shown; False if there is none, or a viewer waits.
+
+        It is given up as soon as a viewer asks for a view, or the frame is no longer shown.
+        Called on the render thread.
+        """
+        order = self.ahead.choose(self._shown_frames())
+        if order is None or self.source.read(order.key[0]) is None:
+            return False
+
+        def is_needless() -> bool:
+            return self._stopped or order.key not in [view.key for view in self._shown_frames()]
+
+        try:
+            with cancellable(is_needless):
+                self.ahead.make(order)
+        except CancelledError:
+            pass
+        except Exception as error:
+            self.ahead.give_up(order, error)
+        self.changed()
+        return True
+
+    def _shown_frames(self) -> list[ShownFrame]:
+        """What viewers' pages show; nothing while a viewer waits for a view."""
+        home = self.renderer.home
+        if home is None or not self.is_ready:
+            return []
+        span = self.source.span
+        shown = []
+        with self.lock:
+            edge = self.edge
+            for session in self._sessions:
+                if not isinstance(session, ViewerSession) or not session.is_content(span, edge):
+                    return []
+                view = session.shown_frame(span, edge, home)
+                if view is not None:
+                    shown.append(view)
+        return shown
 
     def _next_request(self, now: float, span: Span, home: HomeView) -> tuple[Session, RenderRequest] | None:
         """The request of the session that has waited longest, which goes to the end of the queue."""

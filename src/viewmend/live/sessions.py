@@ -1,13 +1,15 @@
 """Viewers' sessions: which view each one needs next, and where the result is sent."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
-from math import sqrt
 from typing import Any
 
+from viewmend.geometry.cameras import Cameras
+from viewmend.live.assets import FrameKey, frame_key
 from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLevel, ResolutionLimit
 from viewmend.live.encoding import Encoders, encode_frame
 from viewmend.live.frame_source import Clock, Span
@@ -39,6 +41,25 @@ class PlaybackState:
     resolution_limit: ResolutionLimit = field(default_factory=ResolutionLimit)
     has_company: bool = False
     """Whether several viewers are connected, active or not."""
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """What a page shows now."""
+
+    time: int
+    """The frame's index."""
+    without: tuple[str, ...]
+    """Cameras that are not used."""
+    eye: Cameras | None
+    """The camera of the viewer's last view; None if there was none yet."""
+    frame_s: float
+    """Seconds until the next frame is shown; infinite while the clock is paused."""
+
+    @property
+    def key(self) -> FrameKey:
+        """The frame and the cameras that are not used."""
+        return frame_key(self.time, self.without)
 
 
 @dataclass(frozen=True)
@@ -103,6 +124,8 @@ class ViewerSession:
         self._frame_numbers = count()
         self.newest_look: Look | None = None
         """The view to show; None before the first look, and after it was cancelled."""
+        self._last_look: Look | None = None
+        """The last look, also if it was cancelled; None before the first."""
         self._look_at = 0.0
         self._advanced_at = now()
         self.requested = RequestedView()
@@ -127,6 +150,7 @@ class ViewerSession:
         if self.newest_look is not self.requested.look:
             self.dropped += 1
         self.newest_look = look
+        self._last_look = look
         self._look_at = self._now()
         self._cancel_final_view()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
@@ -149,6 +173,25 @@ class ViewerSession:
     def wants_views(self) -> bool:
         """Whether there is a look; pages that draw by themselves have none while they move."""
         return self.newest_look is not None
+
+    def is_content(self, span: Span, edge: float) -> bool:
+        """Whether no view has to be rendered: the view at rest is shown at full quality, or the page draws."""
+        look = self.newest_look
+        if look is None:
+            return True
+        shown = self.requested
+        return look is shown.look and self.frame(span, edge) == shown.index and self._is_full
+
+    def shown_frame(self, span: Span, edge: float, home: HomeView) -> ShownFrame | None:
+        """What the page shows now; None before the first frame."""
+        index = self.frame(span, edge)
+        if index < 0:
+            return None
+        look = self._last_look
+        eye = None if look is None else view_camera(look.cameras[0], home, (look.width, look.height))
+        plays = self.clock.playing and span.fps > 0
+        frame_s = 1 / (span.fps * self.clock.speed) if plays else math.inf
+        return ShownFrame(index, () if look is None else look.without, eye, frame_s)
 
     def frame(self, span: Span, edge: float) -> int:
         """The index of the frame to show now; -1 while there is none."""
@@ -262,7 +305,7 @@ class ViewerSession:
 
     def _enlarged(self, look: Look) -> float:
         """Ratio of the side lengths of this look's image to those of a moving one."""
-        return sqrt(look.pixels / self._moving_px)
+        return math.sqrt(look.pixels / self._moving_px)
 
     def _request(self, look: Look, index: int, home: HomeView) -> RenderRequest:
         level = self._level

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from viewmend.completed_cameras import MAX_COMPLETED
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.geometry.cameras import Cameras
@@ -153,5 +154,6 @@ def serve(
     name = model if isinstance(model, str) else default_method() if model is None else type(model).__name__
     inpainter = model if isinstance(model, Inpainter) else make_method(name, device)
     source = RecordedSource(lambda: opened)
-    renderer = Renderer(source, inpainter, config, device, error_model_for(inpainter, device))
+    error_model = error_model_for(inpainter, device)
+    renderer = Renderer(source, inpainter, config, device, error_model, completed_cameras=MAX_COMPLETED)
     return Viewer(renderer, source, host=host, port=port, token=token, budget_ms=budget_ms, model=name)

@@ -189,6 +189,7 @@ export class Page {
       this.notices.source(state);
       this.wake(!this.drawing || !state.playing);
     });
+    on(this.link, "completed", (message) => this.assets.offer(message));
     on(this.link, "show", (view) => this.show(view));
     on(this.assets, "change", (frame) => this.wake(frame === this.drawn));
     on(this.assets, "dropped", (frame) => {

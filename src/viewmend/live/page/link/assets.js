@@ -10,6 +10,7 @@ import { dot, sub, unit } from "../view/matrix.js";
  * @property {number} time its index
  * @property {Shape | null} shape
  * @property {Map<number, CameraImage>} images by the camera's number
+ * @property {Set<number>} extended numbers of the server's completed views that are there, or that it does not have any more
  * @property {number} since when it was asked for, ms
  * @property {boolean} failed
  */
@@ -46,12 +47,15 @@ export function sourcesOf(shape, eye, mode, fillers, usable = () => true) {
   const ranked = rankedCameras(shape, eye).filter(usable);
   const real = ranked.filter((n) => !cameras[n].completed);
   if (mode === "rendered" || mode === "holes") return { first: real.slice(0, blend.cameras), fill: [] };
-  if (!cameras.some((/** @type {any} */ camera) => camera.completed)) {
-    return { first: real.slice(0, blend.cameras), fill: real.slice(blend.cameras, blend.cameras + fillers) };
+  const closest = ranked.slice(0, blend.completed.cameras);
+  if (closest.some((n) => cameras[n].completed)) {
+    return { first: closest, fill: real.filter((n) => !closest.includes(n)).slice(0, blend.cameras) };
   }
-  const first = ranked.slice(0, blend.completed.cameras);
-  return { first, fill: real.filter((n) => !first.includes(n)).slice(0, blend.cameras) };
+  return { first: real.slice(0, blend.cameras), fill: real.slice(blend.cameras, blend.cameras + fillers) };
 }
+
+/** The name of a frame without some cameras, whatever their order. @param {number} time @param {string[]} without */
+const named = (time, without) => [time, ...[...without].sort()].join(" ");
 
 /** Whether as many images are there as the blending rule needs. @param {Frame} frame */
 const complete = ({ shape, images }) => shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
@@ -82,6 +86,8 @@ export class Assets extends EventTarget {
     this.shown = null;
     /** @type {Set<string>} */
     this.waiting = new Set();
+    /** Completed views that the server has made, by frame: see `named`. @type {Map<string, any[]>} */
+    this.completed = new Map();
     this.failures = 0;
     /** Grows when all frames are let go of: what was asked for before is of no use. */
     this.round = 0;
@@ -101,6 +107,7 @@ export class Assets extends EventTarget {
   open(rig) {
     if (rig.assets === this.version) return;
     this.#clear();
+    this.completed.clear();
     this.version = rig.assets ?? null;
     this.failures = 0;
     if (this.version === null || this.worker) return;
@@ -209,7 +216,30 @@ export class Assets extends EventTarget {
     const begins = !playing && !this.drawable(frame, eye); // the first picture shares the line with nothing else
     const missing = [...new Set(begins ? this.needed(frame, eye) : wanted)].filter((n) => !images.has(n));
     for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
+    if (missing.length === 0) this.#extend(frame, eye);
     return missing.length === 0;
+  }
+
+  /** Completed views of a frame that the server has made. @param {{time: number, without: string[], cameras: any[]}} message */
+  offer({ time, without, cameras }) {
+    this.completed.set(named(time, without), cameras);
+    this.dispatchEvent(new CustomEvent("change", { detail: undefined }));
+  }
+
+  /** The completed views of a frame that are offered. @param {Frame} frame @returns {any[]} */
+  #offers({ time }) {
+    return this.completed.get(named(time, this.without.split(",").filter(Boolean))) ?? [];
+  }
+
+  /** Ask for the completed view that is closest to the eye, of those that are missing, once all else is there. @param {Frame} frame @param {number[]} eye */
+  #extend(frame, eye) {
+    if (this.waiting.size) return;
+    const missing = this.#offers(frame).filter(({ number }) => !frame.extended.has(number));
+    if (!missing.length) return;
+    const { center } = /** @type {Shape} */ (frame.shape).header;
+    const near = missing.map((_, n) => nearness({ cameras: missing, center }, eye, n));
+    const closest = missing[near.indexOf(Math.max(...near))];
+    this.#ask(`${frame.time}/${closest.number}`, closest);
   }
 
   /** @param {string} path @param {any} camera */
@@ -224,7 +254,7 @@ export class Assets extends EventTarget {
   /** @param {number} time @returns {Frame} */
   #add(time) {
     /** @type {Frame} */
-    const frame = { time, shape: null, images: new Map(), since: performance.now(), failed: false };
+    const frame = { time, shape: null, images: new Map(), extended: new Set(), since: performance.now(), failed: false };
     this.frames.set(time, frame);
     for (const old of this.frames.values()) if (this.frames.size > KEPT) this.#forget(old);
     return frame;
@@ -252,8 +282,12 @@ export class Assets extends EventTarget {
     const [round, path] = key.split(" ");
     const [time, camera] = path.split("/").map(Number);
     const frame = Number(round) === this.round ? this.frames.get(time) : undefined;
+    const offered = frame && this.#offers(frame).find(({ number }) => number === camera);
     if (!frame) image?.picture.close();
-    else if (shape) frame.shape = shape;
+    else if (offered) {
+      frame.extended.add(camera);
+      if (image) frame.images.set(/** @type {Shape} */ (frame.shape).header.cameras.push(offered) - 1, image);
+    } else if (shape) frame.shape = shape;
     else if (image) frame.images.set(camera, image);
     else if (failed !== undefined) this.#fail(frame);
     if (frame && !frame.failed) {

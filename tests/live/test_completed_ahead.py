@@ -1,0 +1,189 @@
+"""Completed virtual cameras that are made while no viewer waits: which, when, and how pages get them."""
+
+import contextlib
+import json
+import math
+
+import pytest
+import torch
+from live.live_servers import CAMERAS, WAIT_S, get, open_websocket, running, say_hello, wait_until
+from live.test_assets import read_image
+from reference.ball import BallCapture
+
+from viewmend.live.assets import Asset, CompletedImage
+from viewmend.live.completed_ahead import RETRY_S, CompletedAhead
+from viewmend.live.frame_source import RecordedSource
+from viewmend.live.poses import home_view
+from viewmend.live.renderer import Renderer
+from viewmend.live.sessions import ShownFrame
+from viewmend.models.smooth_fill import SmoothFill
+from viewmend.utils.cancellation import stop_if_cancelled
+
+COUNT = 6
+IMAGE_BYTES = 1000
+
+
+class RingRenderer(Renderer):
+    """Makes empty images for a ring of virtual cameras."""
+
+    def __init__(self):
+        super().__init__(
+            RecordedSource(lambda: BallCapture(CAMERAS, 3)), SmoothFill(), completed_cameras=COUNT
+        )
+        self.virtual_cameras = CAMERAS
+        self.assets_version = "a"
+        self.home = home_view(CAMERAS, torch.zeros(3), None)
+
+    def complete_virtual_camera(self, index, without, number):
+        if index == 13:
+            raise RuntimeError("bad luck")
+        return CompletedImage({"number": 100 + number}, Asset(bytes(IMAGE_BYTES), "image/jpeg"))
+
+
+def shown(time: int, eye=None, frame_s=math.inf, without=()) -> ShownFrame:
+    return ShownFrame(time, without, eye, frame_s)
+
+
+@pytest.fixture
+def ahead() -> CompletedAhead:
+    return CompletedAhead(RingRenderer(), memory_mb=COUNT * IMAGE_BYTES / 1e6)
+
+
+def make_all(ahead: CompletedAhead, *frames: ShownFrame) -> list[int]:
+    """Make everything that is due; the numbers of the virtual cameras in their order."""
+    numbers = []
+    while order := ahead.choose(frames):
+        ahead.make(order)
+        numbers.append(order.number)
+    return numbers
+
+
+def test_only_frames_that_a_page_draws_are_completed(ahead):
+    assert ahead.choose([shown(0)]) is None
+    ahead.note_drawn((0, ()))
+    assert ahead.choose([shown(1)]) is None and ahead.choose([shown(0, without=("c1",))]) is None
+    assert make_all(ahead, shown(0)) == list(range(COUNT))
+    assert ahead.counts() == {(0, ()): COUNT} and ahead.changes == COUNT
+    assert ahead.image((0, ()), 103) is not None and ahead.image((0, ()), 3) is None
+
+
+def test_views_near_the_viewer_come_first(ahead):
+    ahead.note_drawn((0, ()))
+    numbers = make_all(ahead, shown(0, CAMERAS[[3]]))
+    angles = (CAMERAS.centers[numbers] @ CAMERAS.centers[3]).tolist()
+    assert numbers[0] == 3 and angles == sorted(angles, reverse=True)
+
+
+def test_the_frames_used_last_are_kept(ahead):
+    for time in (0, 1):
+        ahead.note_drawn((time, ()))
+        make_all(ahead, shown(time))
+    assert ahead.counts() == {(1, ()): COUNT}, "memory for one frame"
+
+
+def test_another_rig_starts_again(ahead):
+    ahead.note_drawn((0, ()))
+    make_all(ahead, shown(0))
+    ahead._renderer.assets_version = "b"
+    assert not ahead.counts() and ahead.choose([shown(0)]) is None
+
+
+def test_a_failure_ends_the_views_of_its_frame(ahead, caplog):
+    ahead.note_drawn((13, ()))
+    order = ahead.choose([shown(13)])
+    with pytest.raises(RuntimeError) as failure:
+        ahead.make(order)
+    ahead.give_up(order, failure.value)
+    assert ahead.choose([shown(13)]) is None and "bad luck" in caplog.text
+
+
+def test_playing_frames_are_completed_only_if_a_view_takes_less_than_a_frame(ahead, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("viewmend.live.completed_ahead.time.monotonic", lambda: now[0])
+    complete = ahead._renderer.complete_virtual_camera
+
+    def slow(*order):
+        now[0] += 0.5
+        return complete(*order)
+
+    ahead._renderer.complete_virtual_camera = slow
+    ahead.note_drawn((0, ()))
+    ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
+    assert ahead.choose([shown(0, frame_s=0.1)]) is None, "the last view took half a second"
+    assert ahead.choose([shown(0, frame_s=0.6)]) and ahead.choose([shown(0)])
+    now[0] += RETRY_S
+    assert ahead.choose([shown(0, frame_s=0.1)]), "tried again"
+
+
+@contextlib.contextmanager
+def page_of(server, **look):
+    """A viewer like a page at rest: it has asked for the first frame's assets, and for a completed view."""
+    with open_websocket(server) as websocket:
+        say_hello(websocket)
+        websocket.send(json.dumps({"type": "clock", "seek": 0, "playing": False}))
+        version = server.service.renderer.assets_version
+        without = ",".join(look.get("without", ()))
+        assert get(f"{server.url}/assets/0?v={version}&without={without}")[0] == 200
+        asked = {"type": "look", "id": 1, "full": True, "width": 32, "height": 32, "modes": ["completed"]}
+        websocket.send(json.dumps(asked | look))
+        yield websocket
+
+
+def hear_completed(websocket, count: int) -> dict:
+    """The message that names this many completed views; frames are acknowledged."""
+    while True:
+        message = websocket.recv(timeout=WAIT_S)
+        if isinstance(message, bytes):
+            websocket.send(json.dumps({"type": "ack", "frame": 0}))
+            continue
+        heard = json.loads(message)
+        if heard["type"] == "completed" and len(heard["cameras"]) == count:
+            return heard
+
+
+@pytest.mark.parametrize("without", [(), ("c9", "c1")])
+def test_a_page_gets_completed_views_as_further_source_images(without):
+    with running(completed_cameras=4) as server, page_of(server, without=without) as page:
+        heard = hear_completed(page, 4)
+        assert heard["time"] == 0 and heard["without"] == sorted(without)
+        real = len(CAMERAS) - len(without)
+        assert sorted(camera["number"] for camera in heard["cameras"]) == [real + n for n in range(4)]
+        version = server.service.renderer.assets_version
+        for camera in heard["cameras"]:
+            assert camera["completed"] is True
+            address = f"{server.url}/assets/0/{camera['number']}?v={version}&without={','.join(without)}"
+            status, headers, content = get(address)
+            assert status == 200 and "immutable" in headers["Cache-Control"]
+            rgb, mask = read_image(content, camera)
+            assert rgb.shape[:2] == mask.shape == (camera["height"], camera["width"]) and mask.max() > 200
+        assert get(f"{server.url}/assets/0/{real + 4}?v={version}")[0] == 404
+
+
+def test_without_a_page_that_draws_nothing_is_completed_ahead():
+    with running(completed_cameras=4) as server, open_websocket(server) as viewer:
+        say_hello(viewer)
+        viewer.send(json.dumps({"type": "look", "id": 1, "width": 32, "height": 32}))
+        wait_until(lambda: server.service.counts["frames"] >= 1)
+        assert not server.service.complete_ahead() and server.service.ahead.changes == 0
+
+
+@pytest.mark.parametrize("news", [{"type": "look", "id": 2, "full": True}, {"type": "clock", "seek": 1}])
+def test_a_view_that_a_viewer_asks_for_comes_first_and_an_old_frame_is_dropped(news):
+    begun = []
+
+    def complete_for_ever(*order):
+        begun.append(order)
+        while True:
+            stop_if_cancelled()
+
+    with running(completed_cameras=4) as server:
+        server.service.renderer.complete_virtual_camera = complete_for_ever
+        with page_of(server) as page:
+            while not isinstance(page.recv(timeout=WAIT_S), bytes):
+                pass
+            page.send(json.dumps({"type": "ack", "frame": 0}))
+            wait_until(lambda: begun)
+            page.send(json.dumps(news))
+            while not isinstance(page.recv(timeout=WAIT_S), bytes):
+                pass
+        assert server.service.ahead.changes == 0
