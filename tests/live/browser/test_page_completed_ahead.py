@@ -39,8 +39,9 @@ def test_a_moving_view_is_drawn_from_completed_views_unless_it_is_shown_as_rende
                 view.drag(120, 0)
                 view.page.wait_for_timeout(300)
                 shown = view.picture()
-                red, green, _ = (shown[..., channel] for channel in range(3))
                 bright = shown.max(-1) > 60
                 assert bright.mean() > 0.02
-                share = ((green > 150) & (red < 60))[bright].mean()
-                assert share > 0.9 if mode == "completed" else share < 0.1
+                # No colour of the ball, and what is left where a camera next to a virtual one counts, too.
+                is_green = shown[..., 1] - shown[..., [0, 2]].max(-1) > 120
+                share = is_green[bright].mean()
+                assert share > 0.5 if mode == "completed" else share < 0.02, share
