@@ -108,7 +108,7 @@ class Walker(threading.Thread):
         self.over = False
 
     def run(self) -> None:
-        with Client(f"ws://{self.address}", again_s=LOST_S, timeout_s=10 * LOST_S) as viewer:
+        with Client(f"ws://{self.address}", reconnect_s=LOST_S, timeout_s=10 * LOST_S) as viewer:
             while not self.over:
                 camera = {
                     "azimuth": 20.0 * time.monotonic() % 360,

@@ -25,7 +25,7 @@ def same_pose(one, other):
 
 
 def test_it_reconnects_with_its_view_and_frame(ball):
-    with Client(ball.ws, again_s=60.0) as viewer:
+    with Client(ball.ws, reconnect_s=60.0) as viewer:
         viewer.send("clock", playing=False, seek=2)
         look = viewer.look(camera=POSE, width=48, height=48)
         before = viewer.frame(look)
@@ -39,7 +39,7 @@ def test_it_reconnects_with_its_view_and_frame(ball):
 
 
 def test_a_seek_is_repeated_until_its_frame_is_shown(ball):
-    with Client(ball.ws, again_s=60.0) as viewer:
+    with Client(ball.ws, reconnect_s=60.0) as viewer:
         viewer.frame(viewer.look(camera=POSE, width=48, height=48))
         break_connections(ball)
         viewer.send("clock", playing=False, seek=2)
@@ -65,13 +65,13 @@ def test_a_refusal_is_not_a_lost_connection(ball):
                 Client(server.ws, "a token, long enough"),
                 pytest.raises(ConnectionError, match=reason) as refused,
             ):
-                Client(server.ws, token, again_s=60.0).__enter__()
+                Client(server.ws, token, reconnect_s=60.0).__enter__()
             assert not isinstance(refused.value, ConnectionLostError)
 
 
 def test_it_gives_up_when_no_server_comes_back():
     with running(ready=False) as server:
-        viewer = Client(server.ws, again_s=0.2).__enter__()
+        viewer = Client(server.ws, reconnect_s=0.2).__enter__()
     with pytest.raises(ConnectionLostError):
         while True:
             viewer.frame()
@@ -80,7 +80,7 @@ def test_it_gives_up_when_no_server_comes_back():
 
 def test_it_waits_for_a_server_that_comes_back(monkeypatch):
     with running() as first:
-        viewer = Client(first.ws, again_s=60.0).__enter__()
+        viewer = Client(first.ws, reconnect_s=60.0).__enter__()
         before = viewer.frame(viewer.look(camera=POSE, width=48, height=48))
     attempts, has_failed, is_done = [], threading.Event(), threading.Event()
     connect = client_module.ServerSocket

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from viewmend.training.run_files import Progress
 
-PARTED_DB = 0.2
+OVERFIT_DB = 0.2
 """Gain on seen views over that on unseen ones, in dB, from which a run is said to memorise its samples."""
 DEFAULT = "views"
 """The recipe if none is named."""
@@ -165,12 +165,12 @@ def _line(progress: "Progress") -> str:
 
 def validation_text(scores: "Mapping[str, float | None]") -> str:
     """The scores of the latest validation on unseen and seen views, and a warning if they part; "" without any."""
-    unseen, seen, parted = (scores.get(name) for name in ("holes", "holes_seen", "parted"))
+    unseen, seen, overfit = (scores.get(name) for name in ("holes", "holes_seen", "overfit"))
     if unseen is None:
         return ""
     if seen is None:
         return f"; validation {unseen:.2f} dB"
     text = f"; validation {unseen:.2f} dB on unseen views, {seen:.2f} on seen ones"
-    if parted is not None and parted > PARTED_DB:
-        text += f" (seen views gained {parted:.2f} dB more: the run memorises its samples)"
+    if overfit is not None and overfit > OVERFIT_DB:
+        text += f" (seen views gained {overfit:.2f} dB more: the run memorises its samples)"
     return text

@@ -83,7 +83,10 @@ def open_capture(
 
 
 def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
-    """The coordinates, in a capture's own files, of the origin that its cameras and bounds refer to; metres."""
+    """Where the origin of a source's cameras and bounds lies in the coordinates of its own files, metres.
+
+    It is 0 unless a `CaptureFolder` moved the origin (see its `origin_m`).
+    """
     while isinstance(source, CaptureWrapper):
         source = source.source
     return source.origin_m if isinstance(source, CaptureFolder) else np.zeros(3)
@@ -133,8 +136,8 @@ class CaptureFolder:
             None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
         )
         self.origin_m = calibration.origin_m
-        """The folder's coordinates of this class's origin, 64 bits; 0 unless the cameras are far
-        from the folder's."""
+        """Where the origin of `cameras` and `bounds` lies in the folder's coordinates, metres, 64 bits. It is
+        moved to the cameras if they are so far from the folder's origin that 32 bits are too coarse."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")
@@ -209,7 +212,7 @@ class CaptureFolder:
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
     def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """The frame with masks of labels or of low levels as opaque ones; says once how they are read."""
+        """The frame with masks up to 255. Converts those of class labels or low grey levels, and logs this once."""
         assert frame.mask is not None
         found = self._label_masks.convert(frame.mask)
         if found is None:
@@ -244,7 +247,7 @@ class CaptureFolder:
         return not missing
 
     def _find_files(self) -> Bool[np.ndarray, "view time"]:
-        listing = functools.cache(lambda parent: names_in(self.folder / parent))  # each folder is listed once
+        list_once = functools.cache(lambda parent: names_in(self.folder / parent))
 
         def exists(path: str) -> bool:
             if not stays_inside(path):
@@ -252,31 +255,36 @@ class CaptureFolder:
                     f"{self.folder}: expected a file inside the folder, got {path}; rename the frame"
                 )
             parent, name = os.path.split(path)
-            return name in listing(parent)
+            return name in list_once(parent)
 
         times = range(len(self.frame_ids))
         present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
         for camera, row in zip(self._entries, present, strict=True):
             if not row.any():
-                absent: list[FileKind] = [
-                    k for k in camera.file_kinds if not any(exists(camera.file(k, f)) for f in self.frame_ids)
-                ]
-                wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
-                wanted = f"the camera's {absent[0]} in at least one frame" if absent else wanted
-                path = camera.file((*absent, *camera.file_kinds)[0], self.frame_ids[0])
-                frame = self.frame_ids[0]
-                where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
-                got = f"found none in {len(self.frame_ids)} frames"
-                next_step = (
-                    f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
-                )
-                raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
+                raise CaptureError(self._describe_unused_camera(camera, exists))
         for time in np.flatnonzero(~present.any(0)).tolist():
-            raise CaptureError(self._without_cameras(time, exists))
+            raise CaptureError(self._describe_empty_frame(time, exists))
         return present
 
-    def _without_cameras(self, time: int, exists: Callable[[str], bool]) -> str:
-        """What is wrong with a frame in which no camera has all of its files, and what to do about it."""
+    def _describe_unused_camera(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
+        """The error message for a camera that lacks a file in every frame."""
+        kinds = camera.file_kinds
+        absent = [
+            kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
+        ]
+        if absent:
+            wanted = f"the camera's {absent[0]} in at least one frame"
+        else:
+            wanted = f"{' and '.join(kinds)} of the camera in the same frame"
+        frame = self.frame_ids[0]
+        path = camera.file((absent or kinds)[0], frame)
+        where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
+        got = f"found none in {len(self.frame_ids)} frames"
+        next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
+        return f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out"
+
+    def _describe_empty_frame(self, time: int, exists: Callable[[str], bool]) -> str:
+        """The error message for a frame in which no camera has all of its files."""
         kinds: list[FileKind] = [
             k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)
         ]
@@ -322,8 +330,9 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
         where = f"{folder}: camera '{camera.name}'"
         raise CaptureError(f"{where}: expected images with alpha, got a video; use another --method")
     files = [folder / camera.file("image", frame) for frame in frames]
-    if not any(uses_alpha(file) for file in files) and (file := next(filter(Path.is_file, files), None)):
-        read_alpha(file, f"{file}: camera '{camera.name}'")
+    existing = [file for file in files if file.is_file()]
+    if existing and not any(uses_alpha(file) for file in files):
+        read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")  # raises the error
     return replace(camera, mask=camera.image)
 
 

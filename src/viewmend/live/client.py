@@ -125,7 +125,7 @@ class Client(Connection):
     url: str = "ws://127.0.0.1:8008"
     token: str | None = None
     timeout_s: float = 30.0
-    again_s: float = 0.0
+    reconnect_s: float = 0.0
     """How long to try to reconnect after the connection was lost; then the last view is requested
     again, at the frame that was shown last. 0: a lost connection is an error."""
     messages: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -157,7 +157,7 @@ class Client(Connection):
         self._max_per_s = RATE * self.messages["welcome"]["limits"]["messages_per_s"]
 
     def _reconnect(self) -> None:
-        end = time.monotonic() + self.again_s
+        end = time.monotonic() + self.reconnect_s
         self._socket.close()
         while True:
             try:
@@ -220,7 +220,7 @@ class Client(Connection):
         try:
             return self._take(end)
         except ConnectionLostError:
-            if self.again_s <= 0:
+            if self.reconnect_s <= 0:
                 raise
         self._reconnect()
         return None

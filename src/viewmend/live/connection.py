@@ -25,7 +25,7 @@ FAULTS_PER_S = 1.0
 FAULTS_AT_ONCE = 19.0
 """A client may send this many malformed messages at once."""
 STATE_S = 300.0
-"""A state is sent again after this many seconds though nothing has changed: the clocks of pages drift."""
+"""A state is sent again after this many seconds even if nothing has changed: the clocks of pages drift."""
 
 
 @dataclass
@@ -44,7 +44,7 @@ async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
 
 @dataclass(frozen=True)
 class StateCauses:
-    """What a message `state` follows from; a new one is considered when this has changed."""
+    """The inputs of a message `state`: as long as they stay the same, no new message is made."""
 
     shared: SharedState
     clock_changes: int
@@ -53,7 +53,7 @@ class StateCauses:
 
 @dataclass(frozen=True)
 class StateContent:
-    """What a page cannot predict of a message `state`; one with the same content is not sent."""
+    """The part of a message `state` that a page cannot predict: as long as it stays the same, none is sent."""
 
     source: dict[str, Any]
     clock_changes: int
@@ -218,10 +218,10 @@ class ViewerConnection:
             self._service.lock.notify_all()
         if isinstance(message, ClockChange):
             self.inform(self._registry.shared_state())
-        self._registry.connections[self] = 0.0  # a check is due
+        self._registry.check_soon(self)
 
     def _update_session(self, message: Message) -> bool:
-        """Apply a message to the viewer's session, under the service's lock; False if it is none of the session's."""
+        """Apply a message to the viewer's session, under the service's lock; False if sessions do not take its type."""
         match message:
             case Look():
                 self._session.look(message)
@@ -252,8 +252,8 @@ class ViewerConnection:
     def inform(self, shared: SharedState) -> float:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        Returns the time before which this need not be called again, unless `shared` changes or the
-        viewer sends a message.
+        Returns the time of the next call, which comes earlier if `shared` changes or the viewer
+        sends a message.
         """
         session = self._session
         now = self._now()

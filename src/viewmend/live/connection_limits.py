@@ -76,8 +76,11 @@ class FairScheduler:
         self._is_planned = False
 
     def submit(self, callback: Callable[[], None], first: bool) -> None:
-        """Call `callback` when its turn comes."""
-        (self._waiting.appendleft if first else self._waiting.append)(callback)
+        """Call `callback` when its turn comes; if `first`, before all others that wait."""
+        if first:
+            self._waiting.appendleft(callback)
+        else:
+            self._waiting.append(callback)
         self._plan()
 
     def withdraw(self, callback: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""The viewers of a server: their sessions, and the task that tells their connections what has changed."""
+"""The viewers of a server: their sessions, and the task that informs their connections of changes."""
 
 import asyncio
 import contextlib
@@ -40,7 +40,7 @@ class Listener(Protocol):
     """A connection, as the registry sees it."""
 
     def inform(self, shared: SharedState) -> float:
-        """Send what is due; returns the time before which nothing is due, unless the shared state changes."""
+        """Send what is due; returns the time of the next call, which comes earlier if the shared state changes."""
         ...
 
     def fail(self, error: Exception) -> None:
@@ -106,6 +106,10 @@ class SessionRegistry:
             self.connections[connection] = connection.inform(shared)
         except Exception as error:
             connection.fail(error)
+
+    def check_soon(self, connection: Listener) -> None:
+        """Inform this connection at the next check."""
+        self.connections[connection] = 0.0
 
     def shared_state(self) -> SharedState:
         """What is the same for all viewers now."""

@@ -78,10 +78,10 @@ def train(
         FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is
             not, and the last checkpoint was kept.
     """
-    with join_processes() as own, _claim(out) if own.first else nullcontext():
-        run = Run(config, out, start, own)
+    with join_processes() as processes, _claim(out) if processes.first else nullcontext():
+        run = Run(config, out, start, processes)
         for progress in run.steps(stopped):
-            if report is not None and own.first:
+            if report is not None and processes.first:
                 report(progress)
     return out
 
@@ -217,16 +217,17 @@ class RunClock:
 class Run:
     """A run in this process: model, averages, optimisers and streams of samples."""
 
-    def __init__(self, config: TrainConfig, out: Path, start: nn.Module | None, own: Processes) -> None:
+    def __init__(self, config: TrainConfig, out: Path, start: nn.Module | None, processes: Processes) -> None:
         out.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(config.seed)
         if start is None and config.start is not None:
             start = config.objective.load_start(config.start)
         self.config = config
         self.out = out
-        self.own = own
-        options = config.objective
-        self.objective = options.objective(_with_precision(config, own.device), options, start).to(own.device)
+        self.processes = processes
+        make_objective = config.objective.objective
+        run_config = _with_precision(config, processes.device)
+        self.objective = make_objective(run_config, config.objective, start).to(processes.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
@@ -237,23 +238,23 @@ class Run:
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
         if self.adversary is not None:
-            self._modules["discriminator"] = self.adversary.discriminator.to(own.device)
+            self._modules["discriminator"] = self.adversary.discriminator.to(processes.device)
             self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
         last = last_checkpoint(out)
         if last:
             self.state = load_run(last, config, self._modules, self._optimizers)
-        self.ddp_objective = own.wrap_ddp(self.objective)
+        self.ddp_objective = processes.wrap_ddp(self.objective)
         self.streams = self._make_streams()
-        self.validation = self.objective.validation if config.validate_every and own.first else None
+        self.validation = self.objective.validation if config.validate_every and processes.first else None
         self.keeps_best = bool(config.scenes.hold_out and config.scenes.captures and config.validate_every)
-        if self.keeps_best and own.first:
+        if self.keeps_best and processes.first:
             self.validation = HeldBackValidation(config.scenes.captures, str(config.scenes.hold_out))
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
         config = self.config
         clock = RunClock(self.config, self.state.step, self.state.elapsed_s)
-        with Log(self.out, self.state.step, self.own.first) as log:
+        with Log(self.out, self.state.step, self.processes.first) as log:
             step = first = self.state.step
             if (
                 step == 0
@@ -265,11 +266,12 @@ class Run:
                 self._validate(log, step)
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
-                # A checkpoint that is older than the best weights would let worse ones replace them.
+                # The checkpoint holds the best score. It must not be older than the best weights: a
+                # resumed run would not know their score, and would replace them by worse ones.
                 due = step > self.state.step and (
                     clock.checkpoint_due() or self.state.best_step > self.state.step
                 )
-                progress, due = self.own.maximum(progress, float(due))
+                progress, due = self.processes.maximum(progress, float(due))
                 if due:
                     self._save(step, clock)
                 if progress >= 1:
@@ -283,7 +285,7 @@ class Run:
                     group["lr"] = rate
                 losses = self._step(step, batches)
                 step += 1
-                pace = clock.pace(step, sum(map(len, batches)) * self.own.count)
+                pace = clock.pace(step, sum(map(len, batches)) * self.processes.count)
                 entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace, self.validated)
                 log.add(entry)
                 if self.validation is not None and step % config.validate_every == 0:
@@ -291,7 +293,7 @@ class Run:
                 yield entry
             if step > self.state.step:
                 self._save(step, clock)
-            elif self.own.first and not self.keeps_best:
+            elif self.processes.first and not self.keeps_best:
                 self._write_model()  # it may be lost or damaged, and a finished run does nothing else
             if self.validation is not None and step > first and step % config.validate_every:
                 self._validate(log, step)
@@ -302,11 +304,12 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Log the scores of the averaged weights; in runs that keep the best weights, write them if they are."""
+        """Log the scores of the averaged weights; a run that keeps the best weights writes them if these are better."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
-        scores |= {"parted": seen_minus_unseen(scores, first)} if "holes_seen" in scores else {}
+        if "holes_seen" in scores:
+            scores |= {"overfit": seen_minus_unseen(scores, first)}
         log.add_validation(step, scores)
         self.validated = scores
         score = scores.get("score")
@@ -318,7 +321,7 @@ class Run:
     def _is_done(self, step: int) -> bool:
         """Whether a run that keeps the best weights has not found better ones for `PATIENCE` validations."""
         waited = step - self.state.best_step
-        return self.own.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
+        return self.processes.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
@@ -328,7 +331,7 @@ class Run:
         count = sum(map(len, batches))
         for number, batch in enumerate(batches):
             # Random numbers depend on the stream and the step, not on the process that computes them.
-            stream = number * self.own.count + self.own.rank
+            stream = number * self.processes.count + self.processes.rank
             torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
             for piece in self._split(batch):
                 share = len(piece) / count
@@ -336,16 +339,16 @@ class Run:
                 # Gradients accumulate here; they meet those of other processes in the last backward pass.
                 is_last = done == count
                 with nullcontext() if is_last else self._without_sync():
-                    samples = [to_device(sample, self.own.device) for sample in piece]
+                    samples = [to_device(sample, self.processes.device) for sample in piece]
                     terms = self._add_gradients(step, samples, share)
-                values = torch.tensor([terms[name] for name in LOSSES], device=self.own.device)
+                values = torch.tensor([terms[name] for name in LOSSES], device=self.processes.device)
                 losses.append(share * values)
         torch.nn.utils.clip_grad_norm_(self.trained, self.objective.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
-            self.adversary.step(self.own.mean)
-        means = self.own.mean(torch.stack(losses).sum(0)).tolist()
+            self.adversary.step(self.processes.mean)
+        means = self.processes.mean(torch.stack(losses).sum(0)).tolist()
         return dict(zip(LOSSES, means, strict=True))
 
     def _without_sync(self) -> AbstractContextManager[None]:
@@ -397,11 +400,12 @@ class Run:
     def _make_streams(self) -> list[SampleReplay[object]]:
         """The streams of this process: numbers rank, rank + count and so on."""
         config = self.config
-        own = self.own
-        count = max(config.streams, own.count)
-        if count % own.count:
+        processes = self.processes
+        count = max(config.streams, processes.count)
+        if count % processes.count:
             raise ValueError(
-                f"expected the same number of streams for each process, got {count} for {own.count}; change either"
+                f"expected the same number of streams for each process, got {count} for {processes.count}; "
+                "change either"
             )
         if self.state.positions and len(self.state.positions) != count:
             raise ValueError(
@@ -409,7 +413,7 @@ class Run:
                 "processes as then"
             )
         streams = []
-        for number in range(own.rank, count, own.count):
+        for number in range(processes.rank, count, processes.count):
             seed = f"{config.seed}/{number}"
             at = self.state.positions[number] if self.state.positions else None
             scenes = self.objective.training_scenes(seed)
@@ -419,9 +423,9 @@ class Run:
         return streams
 
     def _save(self, step: int, clock: RunClock) -> None:
-        positions = self.own.gather([stream.position for stream in self.streams])
+        positions = self.processes.gather([stream.position for stream in self.streams])
         self.state = replace(self.state, step=step, elapsed_s=clock.elapsed_s(), positions=positions)
-        if self.own.first:
+        if self.processes.first:
             save_run(self.out, self.config, self.state, self._modules, self._optimizers)
             if not self.keeps_best:
                 self._write_model()

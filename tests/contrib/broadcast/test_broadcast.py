@@ -115,7 +115,7 @@ def test_the_viewer_on_air_controls_the_broadcast_view(on_air):
 
 
 def test_a_viewer_that_reconnects_is_on_air_again(on_air):
-    with Client(on_air.ws, again_s=WAIT_S) as viewer:
+    with Client(on_air.ws, reconnect_s=WAIT_S) as viewer:
         viewer.frame(viewer.look(width=48, height=48))
         viewer.on_air()
         wait_for_state(viewer, on_air=True)

@@ -182,7 +182,7 @@ def test_a_viewer_reconnects_when_its_replica_is_killed():
         assert status == 200 and picture.startswith(b"\xff\xd8")
         replicas = {json.loads(get(f"{address}/health", HAS_IT)[2])["process"] for _ in range(40)}
         assert len(replicas) == 2, "requests go to both"
-        with Client(address.replace("http", "ws"), TOKEN, again_s=60.0) as viewer:
+        with Client(address.replace("http", "ws"), TOKEN, reconnect_s=60.0) as viewer:
             look = viewer.look(camera={"azimuth": 77.0}, width=48, height=48)
             before = viewer.frame(look)
             for process in replicas:  # one of them serves the viewer

@@ -12,6 +12,8 @@ ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""
 PHASE_GAIN = 0.05
 """Each group moves the ticks by this fraction of its cameras' median offset."""
+ALL_WANTED_RATIO = 1.5
+"""All images are wanted of a camera whose rate is below this many times the rate of the ticks."""
 MAX_COMPLETE = 4
 """This many complete groups are kept until they are taken; the oldest are dropped."""
 
@@ -66,15 +68,17 @@ class Aligner:
         self._groups: dict[int, ImageGroup] = {}
         self._last_finished = -math.inf
         """The last tick that was taken or dropped."""
-        self._newest: dict[str, float] = dict.fromkeys(names, -math.inf)
-        """The last tick of each camera."""
+        self._last_tick: dict[str, float] = dict.fromkeys(names, -math.inf)
+        """The last tick for which each camera sent an image."""
         self._heard_s: dict[str, float] = dict.fromkeys(names, -math.inf)
         """When each camera was heard of last."""
         self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def wants(self, taken_s: float, period_s: float) -> bool:
-        """Whether an image of a camera with this period is the nearest to a tick."""
-        return period_s > self._interval_s / 1.5 or abs(self._nearest(taken_s).offset_s) <= period_s / 2
+        """Whether an image may be used: of a camera much faster than the ticks, only the nearest to each tick is."""
+        if self._interval_s < ALL_WANTED_RATIO * period_s:
+            return True
+        return abs(self._nearest(taken_s).offset_s) <= period_s / 2
 
     def _nearest(self, taken_s: float) -> Tick:
         """The tick nearest to a time; the first call sets tick 0."""
@@ -91,7 +95,7 @@ class Aligner:
             counts["misaligned"] += 1
             return
         tick = self._nearest(timed.taken_s)
-        self._newest[name] = max(self._newest[name], tick.number)
+        self._last_tick[name] = max(self._last_tick[name], tick.number)
         if tick.number <= self._last_finished:
             counts["late"] += 1
             return
@@ -121,7 +125,7 @@ class Aligner:
         present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - ABSENT_S}
         for tick in sorted(self._groups):
             group = self._groups[tick]
-            is_incomplete = any(self._newest[name] < tick for name in present)
+            is_incomplete = any(self._last_tick[name] < tick for name in present)
             if is_incomplete and now_s < group.since_s + self._wait_s:
                 break
             del self._groups[tick]

@@ -36,7 +36,7 @@ SCHEME_OPTIONS = {
     "rtsp": {"rtsp_transport": "tcp"},
     "rtsps": {"rtsp_transport": "tcp"},
 }
-"""FFmpeg's options by scheme: losses do not end the stream."""
+"""Additional options for addresses with these schemes: lost packets do not end the stream."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def read_pictures(
 ) -> Generator[Picture, None, None]:
     """Generate the images of a camera from now on, until it fails; close the generator after use.
 
-    Damaged ("torn") and "duplicated" images are counted in `counts`. `wait(seconds)` is True once
-    none are wanted.
+    Damaged ("torn") and "duplicated" images are counted in `counts`. Recordings are paced by
+    `wait(seconds)`, which returns True to end them.
 
     Raises:
         OSError: it cannot be opened, ends, or is silent.
@@ -191,13 +191,13 @@ class DamageFilter:
     def __init__(self, counts: "Counter[str]") -> None:
         self._counts = counts
         self._has_begun = False
-        """Whether there was a whole image."""
+        """Whether there was an undamaged image."""
         self._damaged_s: float | None = None
-        """When the last damaged image arrived; None after a whole one."""
+        """When the last damaged image arrived; None after an undamaged one."""
 
     def note(self, now_s: float) -> None:
-        """Note a damaged image. Those before the first whole one are not counted: streams are joined in the middle."""
-        self._counts["torn"] += self._has_begun
+        """Note a damaged image."""
+        self._count()
         self._damaged_s = now_s
 
     def accepts(self, frame: "VideoFrame", is_damaged: bool, now_s: float) -> bool:
@@ -206,8 +206,13 @@ class DamageFilter:
             self.note(now_s)
             return False
         if self._damaged_s is not None and not frame.key_frame and now_s < self._damaged_s + DAMAGED_S:
-            self._counts["torn"] += self._has_begun
+            self._count()
             return False
         self._has_begun = True
         self._damaged_s = None
         return True
+
+    def _count(self) -> None:
+        """Count a rejected image, except at the start: a stream that is joined in the middle begins with some."""
+        if self._has_begun:
+            self._counts["torn"] += 1

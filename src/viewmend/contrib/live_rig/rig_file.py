@@ -15,10 +15,12 @@ from viewmend.data.formats import read_any_calibration
 from viewmend.data.native_format import NativeCalibration, NativeCamera
 from viewmend.utils.untrusted_input import one_of, typed
 
-MOST_BYTES = 1_000_000
+MAX_BYTES = 1_000_000
+"""A rig's file is read up to this many bytes."""
 SCHEMES = ("rtsp", "rtsps", "rtp", "http", "https", "udp", "tcp", "srt")
 """Schemes of addresses; anything else is a file or a device."""
 DEVICE = re.compile(r"/dev/video\d+|/dev/v4l/.+")
+"""A file of this name is a V4L2 device."""
 Text = Annotated[str, Meta(min_length=1, max_length=4000)]
 Milliseconds = Annotated[float, Meta(ge=1, le=10_000)]
 
@@ -130,7 +132,7 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     """
     try:
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES)
+            text = file.read(MAX_BYTES)
         rig: RigFile = typed(tomllib.loads(text.decode()), RigFile)
     except OSError as error:
         raise CaptureError(

@@ -28,7 +28,7 @@ WATCH_S = 1.0
 """The rig's file is checked for changes at this interval, in seconds."""
 REPORT_S = 30.0
 """Losses are reported at this interval, in seconds."""
-GATHER_S = 3.0
+FIRST_FRAME_S = 3.0
 """The first frame, which sets alignment and axes, waits this many seconds for all cameras."""
 REPORTED_EVENTS = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
 """The events of a camera that are reported as losses."""
@@ -81,13 +81,13 @@ class RigFileSource(LiveSource):
         self._align = align
         self._match_colours = match_colours
         self._tighten_masks = tighten_masks
-        self._lock_cameras = threading.Condition()
+        self._cameras_lock = threading.Condition()
         self._playback = Playback()
         self._aligner = Aligner((), 1.0, 1.0, 1.0)
         self._workers: dict[str, CameraWorker] = {}
         self._new_workers: list[CameraWorker] = []
         """Workers that `_begin_rig` starts."""
-        self._gather_until_s: float | None = None
+        self._first_frame_until_s: float | None = None
         self._stopped = False
         self._stamp = FileStamp.of(path)
         self._reported: dict[str, dict[str, int]] = {}
@@ -105,8 +105,8 @@ class RigFileSource(LiveSource):
     def stop(self) -> None:
         """End, and close the cameras."""
         self._stopped = True
-        with self._lock_cameras:
-            self._lock_cameras.notify_all()
+        with self._cameras_lock:
+            self._cameras_lock.notify_all()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
         for worker in self._workers.values():
@@ -116,7 +116,7 @@ class RigFileSource(LiveSource):
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
         """Event counts of each camera, and whether it is connected."""
-        with self._lock_cameras:
+        with self._cameras_lock:
             return {
                 name: {"up": int(worker.up), **worker.counts, **self._aligner.counts[name]}
                 for name, worker in self._workers.items()
@@ -128,15 +128,13 @@ class RigFileSource(LiveSource):
         Raises:
             CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
         """
-        # workers of unchanged cameras are kept
-        unchanged = {
-            repr(camera) for camera in rig.cameras
-        }  # cameras hold arrays, which have no plain equality
+        # Workers of unchanged cameras are kept. Cameras hold arrays, so their texts are compared.
+        unchanged = {repr(camera) for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}
         gone = [worker for name, worker in self._workers.items() if name not in kept]
 
-        # recordings are played on one time line
+        # Recordings are played on one time line.
         recordings = [camera for camera in rig.cameras if camera.is_file]
         if recordings:
             self._playback.follow(
@@ -145,7 +143,7 @@ class RigFileSource(LiveSource):
 
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
-        with self._lock_cameras:
+        with self._cameras_lock:
             aligner.counts.update({name: self._aligner.counts[name] for name in kept})
             self._rig = rig
             self._prepared = None
@@ -153,7 +151,7 @@ class RigFileSource(LiveSource):
             workers = kept | new
             self._workers = {name: workers[name] for name in names}
         self._cameras = pinhole_cameras([camera.calibration for camera in rig.cameras])
-        self._gather_until_s = None
+        self._first_frame_until_s = None
         self._new_workers = list(new.values())
         for worker in gone:
             worker.ask_to_stop()
@@ -185,8 +183,8 @@ class RigFileSource(LiveSource):
         reported_s = watched_s
         while not self._stopped:
             try:
-                with self._lock_cameras:
-                    self._lock_cameras.wait(0.1)
+                with self._cameras_lock:
+                    self._cameras_lock.wait(0.1)
                     groups = self._aligner.take(time.monotonic())
                 for group in groups:
                     self._show(group)
@@ -206,8 +204,12 @@ class RigFileSource(LiveSource):
         names = [name for name in self._cameras.names if name in group.by_camera]
         if len(names) < 2:
             return
-        if self._prepared is None and len(names) < len(self._cameras) and self._gathers():
-            return
+        if self._prepared is None and len(names) < len(self._cameras):
+            now_s = time.monotonic()
+            if self._first_frame_until_s is None:
+                self._first_frame_until_s = now_s + FIRST_FRAME_S
+            if now_s < self._first_frame_until_s:
+                return
         images = [group.by_camera[name].images for name in names]
         frame = stack_images(images, self._cameras.select(names), 0)
         if self._prepared is None:
@@ -217,13 +219,6 @@ class RigFileSource(LiveSource):
             return
         self.spread_ms = 1000 * group.spread_s
         self.add(self._prepared.adjust(frame, "the newest frame"))
-
-    def _gathers(self) -> bool:
-        """Whether the first frame still waits for more cameras."""
-        now_s = time.monotonic()
-        if self._gather_until_s is None:
-            self._gather_until_s = now_s + GATHER_S
-        return now_s < self._gather_until_s
 
     def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
         """Check, align and colour-match the rig by its first frame; None while fewer than two cameras see a subject."""
@@ -247,10 +242,10 @@ class RigFileSource(LiveSource):
 
     def _deliver(self, name: str, taken_s: float, images: CameraImages) -> None:
         """Add an image to the aligner; the cameras' workers call this."""
-        with self._lock_cameras:
+        with self._cameras_lock:
             if name in self._aligner.counts:  # else the camera has just left the rig
                 self._aligner.put(name, TimedImages(taken_s, images), time.monotonic())
-                self._lock_cameras.notify()
+                self._cameras_lock.notify()
 
     def _reload_if_changed(self) -> None:
         """Reload the rig file if it has changed; an invalid file is reported and ignored."""

@@ -100,7 +100,7 @@ class CameraWorker:
         self._stopped = threading.Event()
         self._threads = [
             threading.Thread(target=work, name=f"{camera.name} {work.__name__}", daemon=True)
-            for work in (self.read, self.work)
+            for work in (self.read, self.make_masks)
         ]
 
     def start(self) -> None:
@@ -159,8 +159,8 @@ class CameraWorker:
         self.up = False
         self._report(reason)
 
-    def work(self) -> None:
-        """Process the newest image, again and again, until stopped."""
+    def make_masks(self) -> None:
+        """Mask and deliver the newest image, again and again, until stopped."""
         while not self._stopped.is_set():
             try:
                 picture = self._newest.get(timeout=POLL_S)

@@ -5,9 +5,9 @@
 At half the resolution, samples at fixed offsets behind the proxy are taken along every ray, from
 the source cameras that see it best, and aggregated over cameras. A U-Net over the view turns them
 into a distribution over depths, as networks on cost volumes do (MVSNet, ENeRF). At full resolution,
-the cameras are sampled again at the depth found, and blended. What blending softens comes back as
-two bands of detail, each from the blended colours, one camera or the rendered view, with a learned
-gain for every pixel.
+the cameras are sampled again at the depth found, and blended. Blending softens the image, so detail
+is added: in each of two frequency bands, the network takes it from the blended colours, from one
+camera and from the rendered view, with learned gains for every pixel.
 """
 
 from dataclasses import replace
@@ -63,7 +63,7 @@ CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
 """The cameras of a cell are chosen by their prior weights at these z-depths behind the proxy, in
 subject sizes."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
-"""A cell of the U-Net also has its relative depth, and whether it has a depth at all."""
+"""A cell of the U-Net has the channels of `ViewImage`, its relative depth, and whether it has a depth."""
 CANDIDATES = 4
 """A pixel blends this many colours: the fields of `CandidateColours`."""
 DETAILS = 3 * len(BAND_PX)
@@ -129,7 +129,7 @@ class CandidateColours(NamedTuple):
 
 
 class ViewSynthNet(Network):
-    """Predicts colour, alpha, confidence and depth of the pixels in E, on the proxy and the rim around it."""
+    """Predicts colour, alpha, confidence and depth of pixels on the proxy and the rim around it."""
 
     config: ViewsConfig  # pyright: ignore
     trained_in_bfloat16 = True
@@ -180,13 +180,13 @@ class ViewSynthNet(Network):
         where: Mask | None = None,
         guess: Image | None = None,
     ) -> ViewPrediction:
-        """Predicts pixels of a view; its E is not used.
+        """Predicts pixels of a view. `where` selects them; the view's error mask E is ignored.
 
         Args:
             view: the rendered view, or a crop of it.
             sources: the cameras to sample.
             scale: the scale of the whole view, if `view` is a crop.
-            where: the pixels to predict, of those on the proxy and its rim; None for all of these.
+            where: pixels outside this mask are not predicted; None predicts the whole proxy and its rim.
             guess: the `coarse_guess` of the whole view, cropped as `view` is; computed if None.
         """
         if guess is None:
@@ -254,10 +254,10 @@ class ViewSynthNet(Network):
     def step(
         self, view: IncompleteView, context: ContextProvider, state: State
     ) -> tuple[CompletedView, State]:
-        """Predicts all of E on the proxy and its rim, or attenuates it where `view.fade` says so.
+        """Predicts the pixels with E > 0 on the proxy and its rim; those that `view.fade` marks only fade.
 
         With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from
-        their surroundings. What is predicted is steadied by the viewer's last view, its state.
+        their surroundings. Predictions are steadied by the viewer's last view, which is `state`.
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
@@ -269,15 +269,17 @@ class ViewSynthNet(Network):
         sources = None
         if bool(where.any()):
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
+        if sources is None and view.fade is None:
+            return CompletedView(view, view.rgb), state
         if sources is None:
-            return (CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, fades)), state
+            return fallback_view(view, fades), state
 
         # The subject, or a part of it, is predicted
         quick = fraction is not None
         guess = self.coarse_guess(view, sources, quick)
-        ray_fill = guess if not quick and self.coarse is not None else None
+        filled_by_rays = self.coarse is not None and not quick
         prediction = self(view, sources, where=where, guess=guess)
-        completed = prediction.composite_into(view, where, fades, ray_fill)
+        completed = prediction.composite_into(view, where, fades, guess if filled_by_rays else None)
         completed, last = steady(completed, where, state)
         return opaque_in_mask(completed), last
 
@@ -296,15 +298,15 @@ class ViewSynthNet(Network):
         rows, columns = cells.unbind(1)
         proxy_z = depth[rows, columns][:, None]
         uv_px = CELL_PX * (cells.flip(1).double() + 0.5)
-        few = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(CHOOSING_OFFSETS))
-        cameras = choose_cameras(few, sources, RAY_VIEWS)
+        choosing_rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(CHOOSING_OFFSETS))
+        cameras = choose_cameras(choosing_rays, sources, RAY_VIEWS)
         rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(OFFSETS), cameras)
 
-        # Images of cells for the U-Net: the rendered view, and where the proxy is
+        # The U-Net also gets the rendered view, and where the proxy is, also in cells that are not predicted
         front = nearest_depth(view.depth)
         relative = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
-        images = torch.cat([means, relative[None], (front > 0)[None].to(means)])
+        cell_channels = torch.cat([means, relative[None], (front > 0)[None].to(means)])
 
         # Scores of the hypotheses, by their samples and by their neighbourhood
         with self.autocast():
@@ -312,7 +314,9 @@ class ViewSynthNet(Network):
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             stop_if_cancelled()
             with heavy_operations():
-                features = self.unet.forward_points(inputs, cells, concatenate_channels(images.to(inputs)))
+                features = self.unet.forward_points(
+                    inputs, cells, concatenate_channels(cell_channels.to(inputs))
+                )
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
         return DepthDistribution(
             cells, index_image(cells, depth.shape), depth, logits, samples, cameras, features
