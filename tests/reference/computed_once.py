@@ -13,8 +13,8 @@ from torch import Tensor
 from viewmend.data import prepare
 from viewmend.studio import procedural
 
-CHECKS = ("diagnose", "shared_offset", "match_colours")
-"""The dear functions of `viewmend.data.prepare`."""
+CHECKS = ("diagnose", "shared_offset", "match_colours", "find_loose_masks")
+"""The expensive functions of `viewmend.data.prepare`."""
 MAX_SCENES = 16
 """At most this many procedural scenes are remembered; each takes some megabytes."""
 

@@ -81,10 +81,6 @@ class Cell:
     """Features of the true videos, stored in a separate file."""
 
 
-STORED = tuple(f.name for f in fields(Cell) if f.compare)
-"""Fields in the cell's JSON file."""
-
-
 @dataclass(frozen=True)
 class SceneImages:
     """Images of the frame with the largest hole, shared by all methods."""
@@ -116,7 +112,8 @@ class CellStore:
         """Store a cell with its image; its JSON file comes last, so that a cell that is there is complete."""
         self._write(cell.key.stem, image, cell.features)
         values = asdict(replace(cell, features=None, true_features=None))
-        text = json.dumps({name: values[name] for name in STORED}, indent=1, allow_nan=False) + "\n"
+        stored = {field.name: values[field.name] for field in fields(Cell) if field.compare}
+        text = json.dumps(stored, indent=1, allow_nan=False) + "\n"
         write_text(self.folder / f"{cell.key.stem}.json", text)
 
     def save_scene(self, key: CellKey, run: SceneRun) -> None:

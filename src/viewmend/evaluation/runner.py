@@ -35,9 +35,6 @@ class Task:
         return SceneRun(self.scene.name, tuple(MethodRun(name, error=reason) for name in self.methods))
 
 
-Runs = Iterator[tuple[Task, SceneRun]]
-
-
 def run_evaluation(
     scenes: Sequence[LeaveOneOutScene],
     methods: tuple[str, ...],
@@ -107,7 +104,9 @@ def _check(names: list[str], jobs: int) -> None:
         )
 
 
-def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) -> Runs:
+def _run(
+    tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int
+) -> Iterator[tuple[Task, SceneRun]]:
     if jobs == 1:
         loaded: dict[str, Inpainter] = {}
         for task in tasks:

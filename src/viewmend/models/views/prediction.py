@@ -44,9 +44,6 @@ class IslandRule:
     """An island is faint if its mean alpha is below this."""
 
 
-ISLANDS = IslandRule()
-
-
 class DepthDistribution(NamedTuple):
     """The depth hypotheses of the cells of a view, judged by their samples and their neighbours."""
 
@@ -188,16 +185,17 @@ def surface_points(
 
 def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
     """Small islands around the subject all of whose pixels are `predicted`; `colour` is their largest channel."""
-    visible = (torch.maximum(colour, alpha) > ISLANDS.visible).cpu().numpy()
+    rule = IslandRule()
+    visible = (torch.maximum(colour, alpha) > rule.visible).cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:
         return torch.zeros_like(predicted)
     area = stats[:, cv2.CC_STAT_AREA]
     share = area / area[1:].max()
     total_alpha = np.bincount(labels.ravel(), alpha.float().cpu().numpy().ravel())
-    faint = total_alpha < ISLANDS.faint * area
+    faint = total_alpha < rule.faint * area
     rendered = np.bincount(labels[~predicted.cpu().numpy()], minlength=count) > 0
-    small = (share < ISLANDS.tiny) | ((share < ISLANDS.small) & faint)
+    small = (share < rule.tiny) | ((share < rule.small) & faint)
     removed = small & ~rendered
     removed[0] = False  # the background
     return torch.from_numpy(removed[labels]).to(predicted.device)

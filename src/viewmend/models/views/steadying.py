@@ -22,20 +22,14 @@ from viewmend.types import CompletedView
 
 Channels = Float32[np.ndarray, "height width 4"]
 """RGB on black, and alpha."""
-
-
-@dataclass(frozen=True)
-class SteadyingRule:
-    """How much of a difference between aligned views is taken back."""
-
-    weight: float
-    """The largest share that is taken back."""
-    similar: float
-    """The share falls to 1/e of it at this difference, in [0, 1]."""
-
-
-MEANS = SteadyingRule(weight=0.7, similar=0.2)
-DETAIL = SteadyingRule(weight=0.5, similar=0.05)
+MEAN_WEIGHT = 0.7
+"""The largest share of a difference of means that is taken back."""
+MEAN_SIMILAR = 0.2
+"""The share falls to 1/e of `MEAN_WEIGHT` at this difference of means, in [0, 1]."""
+DETAIL_WEIGHT = 0.5
+"""The largest share of a difference of detail that is taken back."""
+DETAIL_SIMILAR = 0.05
+"""The share falls to 1/e of `DETAIL_WEIGHT` at this difference of detail, in [0, 1]."""
 MEAN_PX = 5
 """The means are over squares of this side, pixels."""
 MAX_GAP = 3
@@ -104,13 +98,14 @@ def steadying_change(now: Channels, before: Channels) -> Channels:
 
     difference = moved - now
     means = np.asarray(cv2.blur(difference, (MEAN_PX, MEAN_PX)))
-    return _part(means, MEANS) + _part(difference - means, DETAIL)
+    from_means = _part(means, MEAN_WEIGHT, MEAN_SIMILAR)
+    return from_means + _part(difference - means, DETAIL_WEIGHT, DETAIL_SIMILAR)
 
 
-def _part(difference: Channels, rule: SteadyingRule) -> Channels:
-    """The part of a difference that is taken back."""
+def _part(difference: Channels, weight: float, similar: float) -> Channels:
+    """The part of a difference that is taken back: nearly `weight` of small ones, little of those above `similar`."""
     largest = np.abs(difference).max(-1, keepdims=True)
-    return rule.weight * np.exp(-((largest / rule.similar) ** 2)) * difference
+    return weight * np.exp(-((largest / similar) ** 2)) * difference
 
 
 def _grey(image: Channels) -> UInt8[np.ndarray, "height width"]:
