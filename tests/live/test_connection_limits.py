@@ -284,11 +284,11 @@ async def test_data_that_is_nearly_read_counts_as_read():
     all_limits = ConnectionLimits(clock := FakeClock())
     connection, transport = await connect(all_limits)
     transport.unread = 50_000
-    assert not connection.is_stalled(clock() + limits.UNREAD_S - 1)
+    assert not connection.track_reading(clock() + limits.UNREAD_S - 1)
     clock.advance(limits.UNREAD_S + 1)
-    assert connection.is_stalled(clock())
+    assert connection.track_reading(clock())
     connection.resume_writing()
-    assert not connection.is_stalled(clock() + 1)
+    assert not connection.track_reading(clock() + 1)
 
 
 @in_own_loop

@@ -37,6 +37,8 @@ def agrees_with_the_twin(metric, image, truth):
     assert expected > 0.01 and seen.shape == image.shape[1:]
     assert float(metric(image[None], truth[None])) == pytest.approx(expected, abs=1e-5)
     assert float(seen.mean()) == pytest.approx(expected, abs=1e-5)
+    repeated = seen[:, 1:] == seen[:, :-1]
+    assert float(repeated.float().mean()) < 0.2, "layers are enlarged bilinearly"
     assert not metric.map(truth, truth).any()
     least = MIN_PX[metric.backbone]
     assert metric.map(torch.zeros(3, least - 1, 99), torch.zeros(3, least - 1, 99)) is None

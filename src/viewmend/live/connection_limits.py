@@ -121,18 +121,31 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         self.authenticated = False
         self.requests = 0
         """Requests that are being answered: 0 or 1."""
-        self.since_s = self.idle_since_s = self._read_at_s = limits.now()
+        self.since_s = limits.now()
+        self.idle_since_s = self.since_s
+        """The end of the last request."""
+        self._read_at_s = self.since_s
+        """The last time at which the client had read enough of its data."""
         self._limits = limits
         self._uvicorn: asyncio.BaseProtocol = H11Protocol(
             config, server_state, app_state | {STATE_KEY: self}, _loop
         )
         self._is_websocket = False
-        self.message_bytes = self._max_message_bytes = 0
-        """Bytes that have been read since the application received the last message, and their limit."""
+        self.message_bytes = 0
+        """Bytes that have been read since the application received the last WebSocket message."""
+        self._max_message_bytes = 0
+        """A WebSocket message may have this many bytes."""
         self._held = b""
         """Input that uvicorn has not received yet."""
-        self._received_bytes = self._turns = self._unread_bytes = 0
-        self._input_paused = self._output_paused = self._is_waiting = False
+        self._received_bytes = 0
+        self._unread_bytes = 0
+        """The largest amount of unread output since `_read_at_s`."""
+        self._turns = 0
+        """The number of times that the scheduler has given this connection a turn."""
+        self._is_waiting = False
+        """Whether `_take_turn` waits for a turn."""
+        self._input_paused = False
+        self._output_paused = False
         self._next_request: Callable[[], None] | None = None
         """Continues the request that waits for its turn."""
 
@@ -142,9 +155,12 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         self._max_message_bytes = max_message_bytes
         asyncio.get_running_loop().call_soon(self._forward)
 
-    def is_stalled(self, now: float) -> bool:
-        """Whether the client has read too little of its unread data; to be called once a second."""
+    def allow_pings(self) -> None:
+        """Forget the bytes that pings and pongs may have in a second; to be called once a second."""
         self.message_bytes = max(0, self.message_bytes - MESSAGE_SLACK_BYTES_PER_S)
+
+    def track_reading(self, now: float) -> bool:
+        """Note how much output is unread, and return whether the client reads too slowly."""
         left = self.get_write_buffer_size()
         if left == 0 or left <= self._unread_bytes - UNREAD_BYTES:
             self._read_at_s = now
@@ -209,17 +225,15 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         if self._held and not is_held_back:
             if self.authenticated:
                 self._deliver(len(self._held))
-            elif (
-                not self._is_websocket and not self._is_waiting
-            ):  # a WebSocket is read once it is authenticated
+            elif not (self._is_websocket or self._is_waiting):  # WebSockets are read once authenticated
                 self._is_waiting = True
                 self._limits.scheduler.submit(self._take_turn, self._turns == 0)
-        if not self.is_closing():
-            (
-                self._transport.pause_reading
-                if self._held or self._input_paused
-                else self._transport.resume_reading
-            )()
+        if self.is_closing():
+            return
+        if self._held or self._input_paused:
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
 
     def _take_turn(self) -> None:
         self._is_waiting = False
@@ -249,7 +263,12 @@ class LimitedConnection(asyncio.Protocol, asyncio.Transport):
         """Upgrade to a WebSocket."""
         self._uvicorn = protocol
         self._is_websocket = True
-        asyncio.get_running_loop().call_later(HANDSHAKE_S, lambda: self.requests or self.close())
+        asyncio.get_running_loop().call_later(HANDSHAKE_S, self._end_handshake)
+
+    def _end_handshake(self) -> None:
+        """Close a WebSocket whose handshake has not become a request."""
+        if not self.requests:
+            self.close()
 
     def pause_reading(self) -> None:
         """Hold input back."""
@@ -310,7 +329,8 @@ class ConnectionLimits:
         """Close connections without a request, and drop those that do not read; to be called once a second."""
         now = self.now()
         for connection in list(self.connections):
-            if connection.is_stalled(now):
+            connection.allow_pings()
+            if connection.track_reading(now):
                 connection.abort()
             elif not connection.requests and now - connection.idle_since_s > IDLE_S:
                 connection.close()
