@@ -13,8 +13,12 @@ from viewmend.utils.options import FLAT
 if TYPE_CHECKING:
     from viewmend.data.camera_path import Turntable
     from viewmend.data.capture_folder import CaptureFolder
+    from viewmend.data.prepare import PreparedCapture
     from viewmend.data.source import CaptureSource
+    from viewmend.geometry.bounds import Bounds
     from viewmend.geometry.cameras import Cameras
+    from viewmend.mending import Mender
+    from viewmend.models.base import Inpainter
 
 
 LARGE_PX = 1000
@@ -98,41 +102,27 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
     _check(options)
-    from viewmend.cli.checks import chosen_times, load_named, log_preparation, without_subject
+    from viewmend.cli.checks import chosen_times, load_named, without_subject
     from viewmend.cli.console import announce_duration, print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput, in_words
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
-    from viewmend.data.prepare import prepare
-    from viewmend.data.source import CaptureSubset, prefetch
-    from viewmend.mending import Mender, MendSummary
-    from viewmend.models.base import RenderQuality
-    from viewmend.models.registry import MASK_MODEL, error_model_for
-    from viewmend.stream import StreamConfig
+    from viewmend.data.source import prefetch
+    from viewmend.mending import MendSummary
 
-    render = options.view.config()
+    # Open and prepare the capture
+    options.view.config()  # raises errors of options before anything is read
     turntable = parse_turntable(options.path or "")
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
     usable = _usable(opened, times, held)
     inpainter = load_named(options.model, options.device, options.precision)
-    inputs = [name for name in opened.cameras.names if name not in held]
-    source = opened
-    if options.scale < 1:
-        source = CaptureSubset(opened, range(len(opened.frame_ids)), options.scale)
-    capture = prepare(source, inputs, **asdict(options.preparation), first=usable[0], last=usable[-1])
-    log_preparation(capture)
-    is_needed = render.error_rule == "predicted" or options.geometry == "fused"
-    error_model = error_model_for(inpainter, options.device) if is_needed else None
-    config = StreamConfig(geometry=options.geometry, render=render, memory_mb=None)
-    quality = RenderQuality(top_k=options.top_k)
-    by_prediction = options.protocol == "predicted-mask"
-    mask_model = load_named(MASK_MODEL, options.device, options.precision) if by_prediction else None
-    mender = Mender(
-        inpainter, config, capture.bounds, held, quality, error_model, options.protocol, mask_model
-    )
-    summary = MendSummary(options.protocol)
+    capture = _prepare(options, opened, held, usable)
+
+    # Render and complete the views
+    mender = _make_mender(options, inpainter, capture.bounds, held)
     mender.background = (turntable and turntable.background) or mender.background
+    summary = MendSummary(options.protocol)
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
     frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])
     frame = None
@@ -148,6 +138,8 @@ def run(options: Options) -> int:
             step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
+
+    # Report
     say(f"wrote {options.out}")
     if summary.empty:
         say(
@@ -198,6 +190,44 @@ def _open(options: Options, held: tuple[str, ...]) -> "CaptureFolder":
         got = options.leave_out
         raise CaptureError(f"{options.capture}: expected --leave-out among {known}, got '{got}'")
     return capture
+
+
+def _prepare(
+    options: Options, opened: "CaptureFolder", held: tuple[str, ...], usable: list[int]
+) -> "PreparedCapture":
+    """The capture at the size asked for, aligned and checked by its input cameras."""
+    from viewmend.cli.checks import log_preparation
+    from viewmend.data.prepare import prepare
+    from viewmend.data.source import CaptureSubset
+
+    inputs = [name for name in opened.cameras.names if name not in held]
+    source = opened
+    if options.scale < 1:
+        source = CaptureSubset(opened, range(len(opened.frame_ids)), options.scale)
+    capture = prepare(source, inputs, **asdict(options.preparation), first=usable[0], last=usable[-1])
+    log_preparation(capture)
+    return capture
+
+
+def _make_mender(
+    options: Options, inpainter: "Inpainter", bounds: "Bounds | None", held: tuple[str, ...]
+) -> "Mender":
+    """The pipeline with all models that the options need."""
+    from viewmend.cli.checks import load_named
+    from viewmend.mending import Mender
+    from viewmend.models.base import RenderQuality
+    from viewmend.models.registry import MASK_MODEL, error_model_for
+    from viewmend.stream import StreamConfig
+
+    render = options.view.config()
+    predicts_errors = render.error_rule == "predicted" or options.geometry == "fused"
+    error_model = error_model_for(inpainter, options.device) if predicts_errors else None
+    mask_model = None
+    if options.protocol == "predicted-mask":
+        mask_model = load_named(MASK_MODEL, options.device, options.precision)
+    config = StreamConfig(geometry=options.geometry, render=render, memory_mb=None)
+    quality = RenderQuality(top_k=options.top_k)
+    return Mender(inpainter, config, bounds, held, quality, error_model, options.protocol, mask_model)
 
 
 def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
