@@ -22,6 +22,7 @@ from viewmend.data.checks.synchronisation import (
     describe_delay,
     find_desynchronised_cameras,
 )
+from viewmend.data.errors import Issue
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.studio.stage import Studio, StudioConfig
@@ -122,13 +123,19 @@ def test_good_captures_have_no_issues(good, moving, tmp_path):
 
 
 @pytest.mark.parametrize("words", FATAL)
-def test_fatal_mistakes_are_explained(folder, words):
+def test_fatal_mistakes_are_explained(folder, words, monkeypatch):
     FATAL[words](folder)
-    capture = open_capture(folder)
-    found = [issue.text for issue in diagnose(capture.read(0), capture.bounds) if issue.fatal]
-    assert len(found) == 1 and words in found[0]
+    issues: list[Issue] = []
+
+    def diagnose_once(*arguments):
+        issues.extend(diagnose(*arguments))
+        return tuple(issues)
+
+    monkeypatch.setattr("viewmend.data.prepare.diagnose", diagnose_once)
     with pytest.raises(ValueError) as refused:
-        prepare(capture)
+        prepare(open_capture(folder))
+    found = [issue.text for issue in issues if issue.fatal]
+    assert len(found) == 1 and words in found[0]
     assert found[0] in str(refused.value)
 
 
