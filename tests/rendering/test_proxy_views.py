@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import project
 from viewmend.geometry.mesh import Mesh
+from viewmend.rendering import proxy_views
 from viewmend.rendering.proxy_views import (
     BEHIND,
     CLAY,
@@ -99,3 +100,11 @@ def test_vertices_that_no_camera_sees_have_the_colour_of_their_neighbours():
     colours = vertex_colours(BALL, ContextViews(frame, BALL.depth(camera)))
     assert behind.sum() > 100
     assert torch.allclose(colours, (red / 255).expand_as(colours), atol=0.01)
+
+
+def test_hidden_vertices_get_the_mean_of_all_neighbours():
+    """Also at the border of a mesh, where a neighbour comes after the vertex in no face."""
+    mesh = Mesh(torch.eye(3), torch.tensor([[0, 1, 2]], dtype=torch.int32))
+    colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    spread = proxy_views._spread(colours, torch.tensor([True, True, False]), mesh)
+    assert spread.tolist() == [[1, 0, 0], [0, 0, 1], [0.5, 0, 0.5]]

@@ -3,10 +3,10 @@
 import os
 import secrets
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from viewmend.evaluation.runner import Runs, Task
+from viewmend.evaluation.runner import Task
 from viewmend.evaluation.scene_run import RunSettings, SceneRun, evaluate_scene
 
 ANSWER_S = 5.0
@@ -68,7 +68,7 @@ def connect(ray: Any, address: str, **own: object) -> None:
         ) from error
 
 
-def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Runs:
+def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Iterator[tuple[Task, SceneRun]]:
     """The results of all tasks as they finish; each task runs on one core, or on one GPU.
 
     Machines of the cluster need this package, and captures, people and models at the same paths. A
