@@ -3,9 +3,8 @@
     python research/trace_calls.py [mend] [render] [train]
 
 A hand-over is a call from one file of the package to a function of another; each pair of caller's file and function
-counts once. It goes up if the function's layer is above the caller's in pyproject.toml, and it climbs if its layer is
-above that of the hand-over before it. `mend` is the command on a small capture, `render` a second view of
-`Renderer.render`, and `train` the second step of a tiny model.
+counts once. It goes up if the function's layer is above the caller's in pyproject.toml. `mend` is the command on a
+small capture, `render` a second view of `Renderer.render`, and `train` the second step of a tiny model.
 """
 
 import sys
@@ -14,14 +13,14 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import tyro
 
+import viewmend
 from viewmend.cli import main as run_command
 from viewmend.geometry.hull import HullConfig
 from viewmend.live.frame_source import RecordedSource
@@ -37,7 +36,8 @@ from viewmend.training.views import ViewsObjectiveConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 """The repository has this path."""
-SRC = ROOT / "src" / "viewmend"
+SRC = Path(viewmend.__file__).parent
+"""The package has this path."""
 STAGE = StudioConfig(cameras=6, frames=2, size_px=96)
 """The capture of `mend` and `render`."""
 
@@ -86,12 +86,6 @@ class CallTrace:
     def up(self) -> list[HandOver]:
         """The hand-overs to a higher layer."""
         return [call for call in self.hand_overs if self.floor(call.file) > self.floor(call.caller)]
-
-    @property
-    def climbs(self) -> int:
-        """How often a hand-over is to a higher layer than the one before it."""
-        floors = [self.floor(call.file) for call in self.hand_overs]
-        return sum(after > before for before, after in pairwise(floors))
 
     def _note(self, frame: FrameType, event: str, _: Any) -> None:
         file = self._file_of(frame)
@@ -142,8 +136,17 @@ def trace_train(trace: CallTrace, folder: Path) -> None:
     scenes = SceneConfig(sizes_px=(96,), cameras=(5, 6), num_holdout_views=1, hull_resolution=48)
     model = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8)
     objective = ViewsObjectiveConfig(model=model, sampling=SamplingConfig(num_ray_views=4))
-    config = TrainConfig(name="traced", objective=objective, scenes=scenes)
-    config = replace(config, steps=3, batch=1, new_per_batch=1, replay_size=2, workers=0, validate_every=0)
+    config = TrainConfig(
+        name="traced",
+        objective=objective,
+        scenes=scenes,
+        steps=3,
+        batch=1,
+        new_per_batch=1,
+        replay_size=2,
+        workers=0,
+        validate_every=0,
+    )
     with join_processes() as processes:
         steps = Run(config, folder / "run", None, processes).steps()
         next(steps)
@@ -161,10 +164,10 @@ TRIPS: dict[str, Callable[[CallTrace, Path], None]] = {
 
 
 def main(trips: tyro.conf.Positional[tuple[str, ...]] = tuple(TRIPS), show: bool = False) -> None:
-    """Print the number of hand-overs, files, calls that go up, and climbs of each call.
+    """Print how many hand-overs, files and calls up each trip has.
 
     Args:
-        trips: the calls, of mend, render and train.
+        trips: the calls to trace, among mend, render and train.
         show: print all hand-overs; those that go up are marked.
     """
     unknown = set(trips) - set(TRIPS)
@@ -176,7 +179,7 @@ def main(trips: tyro.conf.Positional[tuple[str, ...]] = tuple(TRIPS), show: bool
         with tempfile.TemporaryDirectory() as folder:
             TRIPS[name](trace, Path(folder))
         counts = f"{len(trace.hand_overs)} hand-overs, {len(trace.files)} files"
-        print(f"{name}: {counts}, {len(trace.up)} calls up, {trace.climbs} climbs")
+        print(f"{name}: {counts}, {len(trace.up)} calls up")
         if show:
             up = set(trace.up)
             print(*(f"    {'UP ' if call in up else '   '}{call}" for call in trace.hand_overs), sep="\n")
