@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 """The repository has this path."""
 PARTS = {
     "geometry": ("tests/geometry", "tests/laws"),
-    "rendering": ("tests/rendering", "tests/test_stream.py"),
+    "rendering": ("tests/rendering", "tests/models/test_error_predictor.py", "tests/test_stream.py"),
     "models": ("tests/models", "tests/laws"),
     "data": ("tests/data",),
     "training": ("tests/training",),
