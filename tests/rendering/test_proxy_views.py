@@ -8,7 +8,7 @@ import torch
 from reference.ball import camera_at, proxy
 from torch.nn.functional import normalize
 
-from viewmend.geometry.cameras import project
+from viewmend.geometry.cameras import project, unproject
 from viewmend.geometry.mesh import Mesh
 from viewmend.rendering import proxy_views
 from viewmend.rendering.proxy_views import (
@@ -77,6 +77,15 @@ def test_the_size_of_near_dots_is_bounded():
     near = replace(BALL, mesh=Mesh(vertices, torch.tensor([[0, 1, 2]]).int()), normals=torch.eye(3))
     dot = hull_points(near, torch.ones(3, 3), camera_at(0, "t", size=96))[3]
     assert float(dot.sum()) == MAX_DOT_PX**2 and float(dot[48, 48]) == 1
+
+
+def test_a_dot_in_the_last_row_and_column_is_drawn_there():
+    camera = camera_at(0, "t", size=96)
+    corner = unproject(torch.tensor([[[95.5, 95.5]]]), torch.ones(1, 1), camera)[0]
+    vertices = torch.cat([corner, torch.tensor([[3.0, 0, -1], [0, 3, -1]])])
+    near = replace(BALL, mesh=Mesh(vertices, torch.tensor([[0, 1, 2]]).int()), normals=torch.eye(3))
+    dot = hull_points(near, torch.ones(3, 3), camera)[3]
+    assert dot.nonzero().amin(0).tolist() == [95 - MAX_DOT_PX // 2] * 2
 
 
 def test_an_empty_proxy_gives_an_empty_image():
