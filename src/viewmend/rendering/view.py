@@ -15,7 +15,7 @@ from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.geometry.threads import light_operations
 from viewmend.rendering.blending import BlendConfig, blend
-from viewmend.rendering.error_mask import MIN_WEIGHT, Evidence, error_rule, holes
+from viewmend.rendering.error_mask import Evidence, error_rule, holes
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 SELECTIONS = ("angle", "direction")
@@ -153,16 +153,17 @@ def _colour(
 
     # find the pixels of the surface that have a colour
     mask = (surface.depth > 0).to(surface.depth)
-    total = blended.weights.sum(0)
-    coloured = mask * (total >= MIN_WEIGHT)
     evidence = Evidence(mask, surface.depth, blended)
+    uncoloured = holes(evidence)
+    coloured = mask - uncoloured
+    total = blended.weights.sum(0)
 
     silhouettes = None if usable.mask is None else Silhouettes(usable.mask, usable.cameras)
     view = IncompleteView(
         camera=target,
         rgb=blended.rgb * coloured,
         mask=mask,
-        error=holes(evidence),
+        error=uncoloured,
         depth=surface.depth,
         source_views=source_views,
         weights=blended.weights / total.clamp(min=torch.finfo(total.dtype).tiny) * coloured,
