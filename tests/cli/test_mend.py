@@ -19,6 +19,7 @@ from viewmend.data.images import write_depth
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.live.renderer import Renderer, RenderRequest
+from viewmend.mending import Mender
 from viewmend.metrics.image_quality import psnr, ssim_map
 from viewmend.models.classical import Telea
 from viewmend.stream import RenderQuality
@@ -54,6 +55,21 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, mend):
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
+
+
+def test_frames_that_the_model_does_not_need_leave_the_memory(folder, tmp_path, mend, monkeypatch):
+    kept = []
+
+    class Watched(Mender):
+        def mend(self, *given):
+            step = super().mend(*given)
+            kept.append(self.stream.times)
+            return step
+
+    monkeypatch.setattr("viewmend.mending.Mender", Watched)
+    monkeypatch.setattr("viewmend.cli.mend.KEPT_MB", 0.0)
+    mend(folder, tmp_path / "out", "--leave-out", "held")
+    assert kept == [(0,), (1,)]
 
 
 def test_the_protocol_says_what_is_known_of_the_camera_left_out(folder, tmp_path, mend, capsys):

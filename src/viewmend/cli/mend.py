@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LARGE_PX = 1000
 """Images whose longer side has more pixels than this take long, which `--scale` avoids."""
+KEPT_MB = 300.0
+"""Earlier frames are kept up to this much memory, MB, if the model does not need them: an orbit may show them again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,7 +227,8 @@ def _make_mender(
     mask_model = None
     if options.protocol == "predicted-mask":
         mask_model = load_named(MASK_MODEL, options.device, options.precision)
-    config = StreamConfig(geometry=options.geometry, render=render, memory_mb=None)
+    memory_mb = None if inpainter.window_frames else KEPT_MB
+    config = StreamConfig(geometry=options.geometry, render=render, memory_mb=memory_mb)
     quality = RenderQuality(top_k=options.top_k)
     return Mender(inpainter, config, bounds, held, quality, error_model, options.protocol, mask_model)
 
