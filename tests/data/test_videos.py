@@ -1,10 +1,15 @@
 """Films: every frame once, upright, at its time, whatever the container claims."""
 
+import multiprocessing
+import os
+import threading
+
 import av
 import numpy as np
 import pytest
 from reference.films import MATRICES, SIZE, picture, set_matrix, write_film
 
+from viewmend.data import videos
 from viewmend.data.errors import CaptureError
 from viewmend.data.videos import VideoFile, decode, to_rgb, video_properties
 
@@ -141,3 +146,34 @@ def test_what_is_no_film_is_said(tmp_path):
     ):
         with pytest.raises(CaptureError, match=rf"{name}.mp4: expected a video, got{got}"):
             video_properties(tmp_path / f"{name}.mp4")
+
+
+def test_a_forked_process_needs_no_thread_of_its_parent(tmp_path, monkeypatch):
+    """Workers of training are forked while validation may read the same films, and have none of its threads."""
+    film = VideoFile(write_film(tmp_path / "a.mp4", FRAMES, options=B_FRAMES))
+    parent = os.getpid()
+    is_reading = threading.Event()
+    may_end = threading.Event()
+
+    def convert(frame):
+        if os.getpid() == parent:
+            is_reading.set()
+            may_end.wait(60)
+        return to_rgb(frame)
+
+    monkeypatch.setattr(videos, "to_rgb", convert)
+    reading = threading.Thread(target=film.read, args=(0, "here"))
+    reading.start()
+    is_reading.wait()
+    fork = multiprocessing.get_context("fork")
+    receiver, sender = fork.Pipe(duplex=False)
+    child = fork.Process(target=lambda: sender.send_bytes(film.read(1, "here").tobytes()))
+    child.start()
+    try:
+        assert receiver.poll(20), "the child waits for a thread of its parent"
+        received = receiver.recv_bytes()
+    finally:
+        child.kill()
+        may_end.set()
+        reading.join()
+    assert received == film.read(1, "here").tobytes()

@@ -6,10 +6,11 @@ length and rate is not trusted.
 """
 
 import functools
+import os
 import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from io import BytesIO
 from itertools import chain, islice
@@ -370,49 +371,61 @@ def _upright(image: np.ndarray, frame: "VideoFrame") -> np.ndarray:
     return image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
+@dataclass
+class _Decoding:
+    """How far one process has decoded a video. It keeps the last frame."""
+
+    frames: "Iterator[tuple[int, VideoFrame]] | None" = None
+    before: int = -1
+    """Index of the frame before the last one that was decoded."""
+    at: int = -1
+    """Index of the last frame that was decoded."""
+    last: "VideoFrame | None" = None
+    image: Image | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
 class VideoFile:
-    """A video, read by frame index. Thread-safe. Frames are cheapest in order of time."""
+    """A video, read by frame index. Threads and forked processes may share it. Frames are cheapest in order of time."""
 
     def __init__(self, path: Path):
         self.path = path
-        self._lock = threading.Lock()
-        self._frames: Iterator[tuple[int, VideoFrame]] | None = None
-        # The indices of the last two frames that were decoded
-        self._before = -1
-        self._at = -1
-        self._last: VideoFrame | None = None
-        self._image: Image | None = None
+        self._decoding: dict[int, _Decoding] = {}
+        """By process: a forked one has neither the decoder's threads nor the thread that may have locked it.
+        It keeps the decoder of its parent, as closing it would wait for these threads."""
 
     def read(self, index: int, where: str) -> Image | None:
         """The frame at `index` as RGB, read-only; None if damaged, a CaptureError that `where` starts if absent."""
-        with self._lock:
+        decoding = self._decoding.setdefault(os.getpid(), _Decoding())
+        with decoding.lock:
             video = video_properties(self.path)
             if index >= video.frames:
                 expected = f"at least {index + 1} frames in the video"
                 got = video.frames
                 next_step = "shorten 'frames' in cameras.json, or export the video again"
                 raise CaptureError(f"{where}: expected {expected}, got {got}; {next_step}")
-            if self._frames is None or index <= self._before or self._skips(video, index):
-                self._frames = decode(video, index)
-                self._before = index - 1
-                self._at = index - 1
-                self._last = None
-            while self._at < index and (found := next(self._frames, None)) is not None:
-                self._before = self._at
-                self._at, self._last = found
-                self._image = None
-            if self._at != index or self._last is None:
+            if decoding.frames is None or index <= decoding.before or _skips(video, decoding.at, index):
+                decoding.frames = decode(video, index)
+                decoding.before = index - 1
+                decoding.at = index - 1
+                decoding.last = None
+            while decoding.at < index and (found := next(decoding.frames, None)) is not None:
+                decoding.before = decoding.at
+                decoding.at, decoding.last = found
+                decoding.image = None
+            if decoding.at != index or decoding.last is None:
                 return None
-            if self._image is None:
-                self._image = to_rgb(self._last)
-            return self._image
+            if decoding.image is None:
+                decoding.image = to_rgb(decoding.last)
+            return decoding.image
 
-    def _skips(self, video: VideoProperties, index: int) -> bool:
-        """Whether seeking is faster than decoding on to a frame."""
-        if video.timestamps is None or index < self._at + SEEK_FRAMES:
-            return False
-        key = bisect_right(video.keys, video.timestamps[index]) - 1
-        return key >= 0 and video.keys[key] > video.timestamps[max(self._at, 0)]
+
+def _skips(video: VideoProperties, at: int, index: int) -> bool:
+    """Whether seeking is faster than decoding on from the frame `at` to another one."""
+    if video.timestamps is None or index < at + SEEK_FRAMES:
+        return False
+    key = bisect_right(video.keys, video.timestamps[index]) - 1
+    return key >= 0 and video.keys[key] > video.timestamps[max(at, 0)]
 
 
 class VideoWriter:
