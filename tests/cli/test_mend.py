@@ -128,6 +128,17 @@ def test_rendered_views_and_the_truth_lie_beside_the_mended_ones(folder, tmp_pat
     assert not (tmp_path / "true").exists() and (tmp_path / "compared.mp4").exists()
 
 
+def test_frames_in_which_the_camera_left_out_is_absent_have_no_true_view(folder, tmp_path, mend):
+    source = shutil.copytree(folder, tmp_path / "gap")
+    (first, *_) = sorted((source / "image" / "held").iterdir())
+    first.unlink()
+    code, report, _ = mend(source, tmp_path / "out", "--leave-out", "held", "--frames", "0:2")
+    assert code == 0 and report["frames"] == 2
+    assert [file.name for file in (tmp_path / "out/true").iterdir()] == ["000001.png"]
+    with av.open(str(tmp_path / "out/compared.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 2
+
+
 def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, mend):
     mend(folder, tmp_path, "--leave-out", "held", "--model", TELLS_ALL, "--error-rule", "all", "--alpha")
     cut = pictures(tmp_path / "cutout", cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]].astype(int)

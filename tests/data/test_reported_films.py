@@ -115,16 +115,17 @@ def test_timecodes_that_do_not_fit_are_named_and_not_used(other_s, text):
     assert text in clock.issues(["a", "b", "c"])[0].text
 
 
-def test_the_timecode_of_a_film_is_read(tmp_path):
-    with av.open(str(tmp_path / "a.mov"), "w") as film:
+@pytest.mark.parametrize("name", ["a.mov", "a.mp4", "a.mkv"])
+def test_the_timecode_of_a_film_is_read(tmp_path, name):
+    with av.open(str(tmp_path / name), "w") as film:
         stream = film.add_stream("libx264", rate=25)
         stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-        stream.metadata["timecode"] = "10:59:59:05"
+        (film if name == "a.mkv" else stream).metadata["timecode"] = "10:59:59:05"
         frame = av.VideoFrame.from_ndarray(picture(0), format="rgb24")
         frame.pts, frame.time_base = 0, Fraction(1, 25)
         film.mux(stream.encode(frame))
         film.mux(stream.encode(None))
-    assert video_track("a", "images", tmp_path / "a.mov").timecode_s == pytest.approx(39599.2)
+    assert video_track("a", "images", tmp_path / name).timecode_s == pytest.approx(39599.2)
 
 
 def test_films_without_times_follow_the_others(tmp_path):

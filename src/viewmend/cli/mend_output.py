@@ -1,7 +1,7 @@
 """The files of `viewmend mend`: rendered, completed and true views, and a contact sheet. All of them, or none."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -98,13 +98,18 @@ class MendOutput:
         """Encode the images as videos; completed.mp4 replaces its images."""
         write_mp4(self._draft / "completed.mp4", self._read("completed"), self._fps)
         kinds = [name for name in ("rendered", "completed", "true") if (self._draft / name).is_dir()]
-        sides = zip(*(self._read(name) for name in kinds), strict=True)
-        panels = (side_by_side(dict(zip(kinds, images, strict=True))) for images in sides)
+        panels = (side_by_side(self._panels(file, kinds)) for file in self._images("rendered"))
         write_mp4(self._draft / "compared.mp4", panels, self._fps)
         if self._alpha:
             cut = (read_rgba(file, str(file)) for file in self._images("cutout"))
             write_webm(self._draft / "cutout.webm", cut, self._fps)
         shutil.rmtree(self._draft / "completed")
+
+    def _panels(self, rendered: Path, kinds: Sequence[str]) -> dict[str, UInt8[np.ndarray, "height width 3"]]:
+        """The images of one view by kind; black where the held-out camera is absent and there is no true one."""
+        black = np.zeros_like(read_rgb(rendered, str(rendered)))
+        files = {kind: self._draft / kind / rendered.name for kind in kinds}
+        return {kind: read_rgb(file, str(file)) if file.is_file() else black for kind, file in files.items()}
 
     def _images(self, name: str) -> list[Path]:
         return sorted((self._draft / name).glob("*.png"))

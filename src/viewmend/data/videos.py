@@ -164,7 +164,9 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         reordered = codec.has_b_frames
         names = set(container.format.name.split(","))
         notes = [container.metadata, *(other.metadata for other in (stream, *container.streams))]
-        timecode = next((found["timecode"] for found in notes if "timecode" in found), None)
+        timecodes = [
+            note[key] for note in notes for key in note if key.lower() == "timecode"
+        ]  # Matroska: capitals
     head = list(islice(_decoded(path), CHECKED_FRAMES))
     if not head:
         raise CaptureError(f"{path}: expected a video, got a file without decodable frames; export it again")
@@ -195,7 +197,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         keys,
         is_timed=not names & WITHOUT_TIMES,
         is_interlaced=2 * sum(frame.interlaced_frame for frame in head) > len(head),
-        timecode=timecode,
+        timecode=timecodes[0] if timecodes else None,
     )
 
 
