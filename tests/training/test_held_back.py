@@ -56,6 +56,8 @@ def test_what_is_held_back_is_described():
     capture = BallCapture(ring(5), frames=31)
     text = HeldBack.of(capture, AUTO).describe(capture)
     assert "camera 'c2' and the last 4 frames" in text and "are held out" in text
+    small = BallCapture(ring(4), frames=31)
+    assert "the last 4 frames (from '027' on) are held out" in HeldBack.of(small, AUTO).describe(small)
     one_frame = BallCapture(ring(5), frames=1)
     assert "camera 'c2' is held out" in HeldBack.of(one_frame, AUTO).describe(one_frame)
 

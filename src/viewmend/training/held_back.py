@@ -85,13 +85,14 @@ class HeldBack:
     def describe(self, capture: CaptureSource) -> str:
         """What is held back, as a sentence."""
         count = len(capture.frame_ids)
+        late = max(0, count - self.first_frame) if count > 1 else 0
         parts = [] if self.camera is None else [f"camera '{self.camera}'"]
-        if count > 1:
-            late = count - self.first_frame
+        if late:
             last = "the last frame" if late == 1 else f"the last {late} frames"
             parts.append(f"{last} (from '{capture.frame_ids[self.first_frame]}' on)")
         what = " and ".join(parts) or "nothing"
-        return f"{capture.name}: {what} {'is' if len(parts) < 2 else 'are'} held out, for validation only"
+        verb = "are" if len(parts) > 1 or (self.camera is None and late > 1) else "is"
+        return f"{capture.name}: {what} {verb} held out, for validation only"
 
 
 def _middle_camera(capture: CaptureSource) -> str:
