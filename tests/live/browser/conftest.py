@@ -12,6 +12,7 @@ import pytest
 from live.browser.stand_in import StandIn
 
 SCREENSHOT_S = 60.0
+"""How long a page may take on a busy machine, seconds."""
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 
 
@@ -40,7 +41,7 @@ class View:
     def __init__(self, page, server, errors: list[str]) -> None:
         self.page, self.server, self.errors = page, server, errors
 
-    def until(self, condition: str | Callable[[], object], seconds: float = 10.0) -> None:
+    def until(self, condition: str | Callable[[], object], seconds: float = SCREENSHOT_S) -> None:
         """Wait for a JavaScript expression or a function to be true."""
         end = time.monotonic() + seconds
         while not (self.page.evaluate(condition) if isinstance(condition, str) else condition()):
@@ -105,6 +106,7 @@ def opened(browser, server, size="desktop", query="?sharp=0", route=None, **opti
     width, height = SIZES[size]
     touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
     context = browser.new_context(viewport={"width": width, "height": height}, **touch, **options)
+    context.set_default_timeout(1000 * SCREENSHOT_S)
     page = context.new_page()
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))

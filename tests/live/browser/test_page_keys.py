@@ -55,7 +55,7 @@ def test_no_pair_of_keys_leaves_half_of_the_picture_empty(browser, mode):
         for key in (str(mode), *pairs(KEYS)):
             view.page.keyboard.press(key)
             pressed.append(key)
-            view.until(lambda: is_filled(view), seconds=5.0)
+            view.until(lambda: is_filled(view))
 
 
 def test_the_comparison_ends_where_it_began(browser, desktop):

@@ -44,6 +44,7 @@ class Performance(View):
         width, height = SIZES[size]
         touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
         self.context = browser.new_context(viewport={"width": width, "height": height}, **touch)
+        self.context.set_default_timeout(1000 * SCREENSHOT_S)
         super().__init__(self.context.new_page(), None, [])
         self.asked: list[str] = []
         self.page.on("request", lambda request: self.asked.append(request.url))
@@ -116,6 +117,8 @@ def test_the_time_line_plays_and_seeks(browser, host):
             return seen >= {str(time) for time in range(FRAMES)}
 
         page.until(all_played, SCREENSHOT_S)
+        frames = re.findall(r"/frames/(\d+)/", " ".join(page.asked))
+        assert frames[:5] == ["0"] * 5, "the first picture shares the line with nothing else"
         page.page.locator("#seek").fill("3")
         page.page.keyboard.press("Space")
         page.page.locator("#seek").fill("1")

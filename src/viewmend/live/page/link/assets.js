@@ -180,7 +180,7 @@ export class Assets extends EventTarget {
   want(time, eye, { first, end }, { playing, framesPerMs, live }) {
     const count = Math.max(1, end - first);
     const late = playing && !this.patient ? Math.ceil(framesPerMs * this.#expected()) : 0;
-    const ahead = playing && !live ? Math.min(count - 1, (this.patient ? AHEAD_PATIENT : AHEAD) + late) : 0;
+    const ahead = playing && !live && !this.#begins ? Math.min(count - 1, (this.patient ? AHEAD_PATIENT : AHEAD) + late) : 0;
     const steps = (/** @type {Frame} */ frame) => (((frame.time - time) % count) + count) % count;
     let loading = 0;
     for (const frame of this.frames.values()) {
@@ -194,6 +194,11 @@ export class Assets extends EventTarget {
       this.#load(this.#add(index), eye, playing);
       loading += 1;
     }
+  }
+
+  /** Whether nothing was shown yet, and the clock waits: the first picture shares the line with nothing else. */
+  get #begins() {
+    return this.patient && this.shown === null;
   }
 
   /** How long the next frame will probably take, ms. */
@@ -213,8 +218,8 @@ export class Assets extends EventTarget {
     }
     const played = this.modes.map((mode) => sourcesOf(shape, eye, mode, this.fillers));
     const wanted = playing ? played.flatMap(({ first, fill }) => [...first, ...fill]) : rankedCameras(shape, eye);
-    const begins = !playing && !this.drawable(frame, eye); // the first picture shares the line with nothing else
-    const missing = [...new Set(begins ? this.needed(frame, eye) : wanted)].filter((n) => !images.has(n));
+    const drawsFirst = (!playing || this.#begins) && !this.drawable(frame, eye);
+    const missing = [...new Set(drawsFirst ? this.needed(frame, eye) : wanted)].filter((n) => !images.has(n));
     for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
     if (missing.length === 0) this.#extend(frame, eye);
     return missing.length === 0;
