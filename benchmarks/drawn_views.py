@@ -268,8 +268,9 @@ def judge(
     """Add a pose's scores."""
     for name, rgb in pictures.items():
         lpips = detail_scores(rgb, rgb, truth, dict(metrics))["lpips_alex"]
-        assert lpips is not None, "LPIPS is always defined"
-        scores.views.setdefault(name, []).append(Score(float(psnr(rgb, truth.rgb)), lpips))
+        psnr_db = psnr(rgb, truth.rgb)
+        assert lpips is not None and psnr_db is not None, "views have pixels"
+        scores.views.setdefault(name, []).append(Score(psnr_db, lpips))
 
 
 def report(name: str, scores: SetScores) -> dict[str, Any]:
