@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from reference.ball import BallCapture, ring
+from reference.ball import AwayBall, BallCapture, ring
 from reference.other_device import other_device
 from reference.shared_scenes import TAKES
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_image
+from viewmend.data.native_writer import write_capture
 from viewmend.metrics.lpips import load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.views.model import ViewSynthNet
@@ -106,6 +107,13 @@ def test_what_is_held_back_is_scored(place):
     table = list(held_back_views(place, AUTO, table=True))
     assert [view.camera for view in table] == ["cam02", "cam00", "cam01", "cam03", "cam04"]
     assert {view.truth.time for view in table} == {3}
+
+
+@pytest.mark.parametrize("empty", [{19}, {18, 19}])
+def test_the_table_shows_the_subject_also_if_it_has_left(empty, tmp_path):
+    write_capture(AwayBall(ring(5), 20, empty), tmp_path / "ball", images="png")
+    views = list(held_back_views(tmp_path / "ball", AUTO, table=True))
+    assert len(views) == 5 and all(bool(view.truth.mask.any()) for view in views)
 
 
 def test_of_a_splits_file_the_last_frames_are_held_back(balls, tmp_path):
