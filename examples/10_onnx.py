@@ -13,8 +13,8 @@ import onnxruntime
 from viewmend import CachedFrame, IncompleteView, Stream, Studio, StudioConfig, load_inpainter, orbit
 
 
-def inputs_of(view: IncompleteView, cached: CachedFrame) -> dict[str, np.ndarray]:
-    """The arrays that an exported model takes for a rendered view."""
+def inputs_of(view: IncompleteView, cached: CachedFrame, num_views: int) -> dict[str, np.ndarray]:
+    """The arrays that an exported model takes for a rendered view; `num_views` cameras are sampled at most."""
     names = view.candidate_views
     frame = cached.frame.select(names)
     weights = dict(zip(view.source_views, view.weights, strict=True))
@@ -23,7 +23,7 @@ def inputs_of(view: IncompleteView, cached: CachedFrame) -> dict[str, np.ndarray
     tensors |= {"images": frame.rgb, "masks": frame.mask, "proxy_depths": cached.depth(names)}
     tensors |= {"rig_K": frame.cameras.K, "rig_camera_from_world": frame.cameras.camera_from_world}
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    chosen = names[:8]
+    chosen = names[:num_views]
     zero = np.zeros_like(arrays["mask"])
     arrays["weights"] = np.stack([weights[name].numpy() if name in weights else zero for name in chosen])
     arrays["chosen"] = np.arange(len(chosen))
@@ -43,7 +43,9 @@ def main(out: Path, model: str = "views", size_px: int = 256) -> float:
 
     session = onnxruntime.InferenceSession(out)
     wanted = {given.name for given in session.get_inputs()}
-    arrays = {name: array for name, array in inputs_of(view, cached).items() if name in wanted}
+    num_views = len(stream.inpainter.source_names(view))
+    arrays = inputs_of(view, cached, num_views)
+    arrays = {name: array for name, array in arrays.items() if name in wanted}
     [completed_rgb] = session.run(["completed_rgb"], arrays)  # also alpha, confidence and completed_depth
 
     completed, _ = stream.inpainter.step(view, stream.context_provider(), stream.inpainter.initial_state())
