@@ -11,6 +11,7 @@ from viewmend.models.base import ContextProvider
 from viewmend.models.compositing import blend
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views import ray_fill
+from viewmend.models.views.config import CONTRAST
 from viewmend.models.views.pyramids import SourceCameras
 from viewmend.models.views.ray_fill import (
     CELLS,
@@ -20,6 +21,7 @@ from viewmend.models.views.ray_fill import (
     gather_ray_inputs,
     multi_scale_context,
 )
+from viewmend.models.views.sampler import CameraFeatures
 
 SOURCES = SourceCameras.of(context(5), None)
 
@@ -92,6 +94,39 @@ def test_chunks_of_pixels_give_the_same_in_few_sizes(monkeypatch):
     for pixels in (1, 7, 65, len(missing)):
         net.mix(gather_ray_inputs(incomplete, SOURCES, missing[:pixels]))
     assert len(missing) > 65 and sizes and all(size % PIXELS_STEP == 0 for size in sizes)
+
+
+@torch.no_grad()
+def test_cameras_are_compared_as_by_one_layer_on_all_inputs():
+    net, incomplete = tiny_rays(), view(5)
+    sources = SourceCameras.of(context(5, ("left", "third", "right")), None)
+    inputs = gather_ray_inputs(incomplete, sources, torch.nonzero(incomplete.error > 0)[:40])
+    expected_colours, expected = points_reference(net, inputs.features, inputs.smallest_masks)
+    colours, features = net._points(inputs.features, inputs.smallest_masks)
+    torch.testing.assert_close(colours, expected_colours, atol=1e-5, rtol=0)
+    torch.testing.assert_close(features, expected, atol=1e-4, rtol=0)
+
+
+def points_reference(net, features, smallest_masks):
+    """`RayFill._points` with every input repeated for every camera."""
+    at = CameraFeatures.unstack(features)
+    colours = torch.cat([at.colour, at.mean_colour, at.mean_coverage], -1)
+    prior = at.in_view * (4 * at.viewing_cosine).exp() * (-4 * at.depth_difference).sigmoid()
+    prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
+    mean = (prior * colours).sum(2, keepdim=True)
+    variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
+    own = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
+    looked = net.look(own)
+    together = looked + (prior * looked).sum(2, keepdim=True)
+    smallest = smallest_masks[:, :, None, ::2].expand(*prior.shape[:-1], -1)
+    repeated = [own, mean.expand_as(colours), variance.expand_as(colours), together, smallest, prior]
+    compared = net.compare(torch.cat(repeated, -1))
+    scores = net.trust(compared) + (prior + 1e-4).log()
+    trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
+    agreed = (trust * colours).sum(2)
+    spread = CONTRAST * (trust * (colours - agreed[:, :, None]) ** 2).sum(2)
+    point = [(trust * compared).sum(2), agreed, spread, smallest_masks, (trust**2).sum(2)]
+    return agreed[..., :3], net.point(torch.cat(point, -1))
 
 
 @torch.no_grad()

@@ -270,12 +270,16 @@ def run_tiled(
     tile_columns = tiles % across
     at_border = _reaches_border(tile_rows, tile_columns, halo, shape)
 
-    # Windows of all tiles: indices of values, and cells
+    # Windows of all tiles: indices of values, and of cells
     padded_values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
     padded_index = F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1)
     index = _windows(padded_index, halo, TILE_PX)[0]
-    padded_cells = F.pad(cells, _frame(cells.shape[2:], cell_halo, TILE_PX // CELL_PX), mode="replicate")
-    near = _windows(padded_cells[0], cell_halo, TILE_PX // CELL_PX)
+    grid = cells.shape[2:]
+    cell_values = cells[0].movedim(0, 2).flatten(0, 1)
+    numbers = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
+    frame = _frame(grid, cell_halo, TILE_PX // CELL_PX)
+    padded_numbers = F.pad(numbers, frame, mode="replicate").long()
+    near = _windows(padded_numbers[0], cell_halo, TILE_PX // CELL_PX)[0]
 
     outputs = []
     first = 0
@@ -284,7 +288,7 @@ def run_tiled(
         size = next(size for size in AT_ONCE if size <= len(tiles) - first)
         rows = tile_rows[first : first + size]
         columns = tile_columns[first : first + size]
-        coarse = near[:, rows, columns].movedim(0, 1)
+        coarse = cell_values[near[rows, columns]].movedim(3, 1)  # interpolation is faster with channels last
         fine = F.interpolate(coarse, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
         fine = fine[:, :, cut:-cut, cut:-cut].to(values)
         x = torch.cat([fine.movedim(1, 3), padded_values[index[rows, columns]]], 3).movedim(3, 1)

@@ -203,13 +203,19 @@ class RayFill(Network, Fill):
         mean = (prior * colours).sum(2, keepdim=True)
         variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
 
-        # Compare each camera with all of them; channels are in the order that the layers were trained on.
+        # Compare each camera with all of them; channels are in the order that the layers were trained on. The first
+        # layer runs once per point, instead of once per camera, on what the cameras share.
         ordered = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
         looked = self.look(ordered)
-        together = looked + (prior * looked).sum(2, keepdim=True)
-        smallest = smallest_masks[:, :, None, ::2].expand(*prior.shape[:-1], -1)
-        inputs = [ordered, mean.expand_as(colours), variance.expand_as(colours), together, smallest, prior]
-        compared = self.compare(torch.cat(inputs, -1))
+        first = self.compare[0]
+        widths = (ordered.shape[-1], COLOUR_CHANNELS, COLOUR_CHANNELS, looked.shape[-1], 2, 1)
+        of_camera, of_mean, of_variance, of_look, of_masks, of_prior = first.weight.split(widths, 1)
+        own = F.linear(torch.cat([ordered, looked, prior], -1), torch.cat([of_camera, of_look, of_prior], 1))
+        together = (prior * looked).sum(2)
+        shared = torch.cat([mean[:, :, 0], variance[:, :, 0], together, smallest_masks[:, :, ::2]], -1)
+        shared_weight = torch.cat([of_mean, of_variance, of_look, of_masks], 1)
+        added = F.linear(shared, shared_weight, first.bias)
+        compared = self.compare[1:](own + added[:, :, None])
 
         # What the trusted cameras show, and how much they agree
         scores = self.trust(compared).float() + (prior + 1e-4).log()
