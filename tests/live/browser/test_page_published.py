@@ -117,9 +117,6 @@ def test_the_time_line_plays_and_seeks(browser, host):
             return seen >= {str(time) for time in range(FRAMES)}
 
         page.until(all_played, SCREENSHOT_S)
-        asked = re.findall(r"/frames/(\d+)/", " ".join(page.asked))[:5]
-        most = max(asked.count(frame) for frame in asked)
-        assert most >= 4, "the first picture hardly shares the line: the clock may reach one more frame"
         page.page.locator("#seek").fill("3")
         page.page.keyboard.press("Space")
         page.page.locator("#seek").fill("1")
