@@ -82,7 +82,12 @@ async def test_what_is_shown_while_the_first_page_opens_reaches_it():
     """The program sets it on its own thread, perhaps just after the page was informed."""
     source = Mock(span=Span(), status=SourceStatus())
     service = Mock(
-        spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0
+        spec=RenderService,
+        source=source,
+        renderer=Mock(rig_json=None),
+        error=None,
+        now=lambda: 0.0,
+        ahead=Mock(changes=0),
     )
     registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
     page.inform.side_effect = lambda shared: shown.append(shared.show) or math.inf

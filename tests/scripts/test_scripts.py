@@ -58,6 +58,7 @@ def test_a_script_prints_its_help(script, alone, capsys):
 def test_most_files_are_scripts():
     helpers = {name_of(file) for file in FILES} - {name_of(script) for script in SCRIPTS}
     assert helpers == {
+        "benchmarks/live_chromium.py",
         "benchmarks/measure.py",
         "benchmarks/tests_path.py",
         "research/benchmarks_path.py",
