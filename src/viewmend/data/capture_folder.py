@@ -269,7 +269,7 @@ class CaptureFolder:
     def _describe_unused_camera(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
         """The error message for a camera that lacks a file in every frame."""
         kinds = camera.file_kinds
-        absent = [
+        absent: list[FileKind] = [
             kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
         ]
         if absent:
@@ -277,7 +277,8 @@ class CaptureFolder:
         else:
             wanted = f"{' and '.join(kinds)} of the camera in the same frame"
         frame = self.frame_ids[0]
-        path = camera.file((absent or kinds)[0], frame)
+        kind: FileKind = (absent or list(kinds))[0]
+        path = camera.file(kind, frame)
         where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
         got = f"found none in {len(self.frame_ids)} frames"
         next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"

@@ -208,6 +208,7 @@ class RayFill(Network, Fill):
         ordered = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
         looked = self.look(ordered)
         first = self.compare[0]
+        assert isinstance(first, nn.Linear)
         widths = (ordered.shape[-1], COLOUR_CHANNELS, COLOUR_CHANNELS, looked.shape[-1], 2, 1)
         of_camera, of_mean, of_variance, of_look, of_masks, of_prior = first.weight.split(widths, 1)
         own = F.linear(torch.cat([ordered, looked, prior], -1), torch.cat([of_camera, of_look, of_prior], 1))
