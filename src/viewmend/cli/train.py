@@ -164,8 +164,10 @@ def _line(progress: "Progress") -> str:
 
 
 def validation_text(scores: "Mapping[str, float | None]") -> str:
-    """The scores of the latest validation on unseen and seen views, and a warning if they part; "" without any."""
-    unseen, seen, overfit = (scores.get(name) for name in ("holes", "holes_seen", "overfit"))
+    """The latest scores on unseen and seen views, with a warning if the run overfits; "" without a validation."""
+    unseen = scores.get("holes")
+    seen = scores.get("holes_seen")
+    overfit = scores.get("overfit")
     if unseen is None:
         return ""
     if seen is None:

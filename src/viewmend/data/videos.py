@@ -411,7 +411,10 @@ class VideoFile:
                 decoding.before = index - 1
                 decoding.at = index - 1
                 decoding.last = None
-            while decoding.at < index and (found := next(decoding.frames, None)) is not None:
+            while decoding.at < index:
+                found = next(decoding.frames, None)
+                if found is None:
+                    break
                 decoding.before = decoding.at
                 decoding.at, decoding.last = found
                 decoding.image = None
