@@ -56,8 +56,6 @@ TURN_SEED = 10001
 """Seed of the studio of the turn."""
 TURN_STEP_DEG = 60.0
 """Angle between neighbouring cameras of the turn's studio, degrees."""
-DRAWN_TIMES = 10
-"""A view is painted this many times to measure how long it takes."""
 HARNESS = """<!doctype html><canvas id="picture"></canvas><script type="module">
 import { Stage } from "./page/draw/stage.js";
 import { Assets } from "./page/link/assets.js";
@@ -161,6 +159,9 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=SETS)
     parser.add_argument("--views", type=int, default=8, help="number of views per set, evenly spaced")
     parser.add_argument("--size", type=int, default=320, help="width and height of the views of P and turn")
+    parser.add_argument(
+        "--paints", type=int, default=10, help="a view is painted this many times to be timed"
+    )
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each method")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
@@ -172,15 +173,16 @@ def main() -> None:
         for name in options.sets:
             scores = SetScores()
             for number, frame in enumerate(poses(name, options.views, options.size)):
-                pictures = draw(frame, host, page, scores)
+                pictures = draw(frame, host, page, scores, options.paints)
                 truth = true_view(frame.truth, "black")
                 judge(pictures, truth, metrics, scores)
                 if options.sheets:
                     save(pictures | {"true": truth.rgb}, options.sheets / f"{Path(name).name}-{number}.png")
+                print(f"  {number}: {method_lpips(scores)}", flush=True)
             results[name] = report(name, scores)
-    if options.write:
-        config = {key: getattr(options, key) for key in ("sets", "views", "size")}
-        print(write("drawn_views", "cpu", config, results))
+            if options.write:  # after every set, so that nothing is lost if a later one fails
+                config = {key: getattr(options, key) for key in ("sets", "views", "size")}
+                print(write("drawn_views", "cpu", config, results), flush=True)
 
 
 def poses(name: str, count: int, size_px: int) -> Iterator[LeaveOneOutFrame]:
@@ -210,9 +212,9 @@ def turn(count: int, size_px: int) -> Iterator[LeaveOneOutFrame]:
 
 
 def draw(
-    frame: LeaveOneOutFrame, host: Host, page: Any, scores: SetScores
+    frame: LeaveOneOutFrame, host: Host, page: Any, scores: SetScores, paints: int
 ) -> dict[str, Float[Tensor, "3 height width"]]:
-    """The left-out camera's view by the model, and as the page draws it."""
+    """The left-out camera's view by the model, and as the page draws it, `paints` times to be timed."""
     stream = Stream(make_method("views"), StreamConfig(memory_mb=None), frame.bounds)
     cached = stream.add_frame(frame.inputs)
     proxy = cached.proxy
@@ -238,7 +240,7 @@ def draw(
     page.goto(host.address)
     page.wait_for_function("window.ready", timeout=600_000)
     for name, with_virtual in (("page", False), ("page+virtual", True)):
-        asked = [viewer_json(target), with_virtual, DRAWN_TIMES]
+        asked = [viewer_json(target), with_virtual, paints]
         png, paint_ms = page.evaluate("(asked) => window.drawView(...asked)", asked)
         encoded = np.frombuffer(base64.b64decode(png.split(",")[1]), np.uint8)
         rgb = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
@@ -271,6 +273,11 @@ def judge(
         psnr_db = psnr(rgb, truth.rgb)
         assert lpips is not None and psnr_db is not None, "views have pixels"
         scores.views.setdefault(name, []).append(Score(psnr_db, lpips))
+
+
+def method_lpips(scores: SetScores) -> dict[str, float]:
+    """The LPIPS of the last pose, by who made the view."""
+    return {method: round(found[-1].lpips, 4) for method, found in scores.views.items()}
 
 
 def report(name: str, scores: SetScores) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
             lambda: session.newest_look is not None and session.newest_look.without == (NAME,), SCREENSHOT_S
         )
         view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
-        assert texts(view, "left-name", "right-name") == ["views", "Original"]
+        assert texts(view, "left-name", "right-name") == ["Completed (views)", "Original"]
         asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={NAME}&without={NAME}"
         score = float(get(asked)[1]["X-Viewmend-PSNR"])
         assert f"subject {score:.1f} dB" in view.page.locator("#error-name").inner_text()
@@ -84,7 +84,7 @@ def test_two_models_are_compared(browser, ball):
         )
         assert session.newest_look.model == "paper-small"
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
-        assert texts(view, "right-name") == ["paper-small"] and ball.service.error is None
+        assert texts(view, "right-name") == ["Completed (paper-small)"] and ball.service.error is None
 
 
 def test_depth_and_errors_have_a_scale(browser, ball):

@@ -120,7 +120,7 @@ export class Page {
       KeyR: () => this.reset(), Home: () => this.reset(),
       KeyF: () => this.controls.movement(this.motion.mode === "fly" ? "orbit" : "fly"),
       KeyN: () => this.cameras.next(1), KeyB: () => this.cameras.next(-1),
-      KeyX: () => this.cameras.toggleInput(),
+      KeyX: () => this.toggleInput(),
       KeyG: flip("rig"), KeyT: flip("reproject"), KeyH: flip("panel"),
       KeyP: tools.shot, KeyC: () => this.paths.toggleRecording(), "?": tools.help,
       Space: () => transport.toggle(), KeyL: () => transport.live(),
@@ -132,6 +132,17 @@ export class Page {
   reset() {
     if (this.motion.rig) this.motion.reset();
     this.wake();
+  }
+
+  /** The camera that the view is at or moves to; null if it is at none. */
+  get camera() {
+    return this.source.live && this.motion.goal === this.snapped?.goal ? this.snapped?.camera ?? null : null;
+  }
+
+  /** Leave out or use the camera of the newest pose, which may not have been painted yet. */
+  toggleInput() {
+    this.cameras.at(this.camera);
+    this.cameras.toggleInput();
   }
 
   /** What the server's program wants to be seen. @param {{pose?: any, time?: number, mode?: string}} view */
@@ -389,8 +400,7 @@ export class Page {
 
   /** The image of the camera that the view is at, and the view's score if that camera is left out. */
   compare() {
-    const { settings, transport, motion } = this;
-    const camera = this.source.live && motion.goal === this.snapped?.goal ? this.snapped?.camera ?? null : null;
+    const { settings, transport, motion, camera } = this;
     this.cameras.at(camera);
     const split = settings.shown.includes("original");
     const leftOut = camera && settings.without.includes(camera.name);

@@ -48,7 +48,7 @@ const DEFAULTS = {
 };
 
 const PICTURES = ["rendered", "holes", "completed", "depth", "coverage", "confidence", "hull", "points"];
-/** What a split view shows besides: another model's output, the image of the camera that the view is at, and the difference. */
+/** What a split view shows besides: the view completed by another model, the image of the camera that the view is at, and the difference. */
 export const COMPARED = /^(compared:[\w.-]+|original|error)$/;
 /** The mode that the server knows, or the page's own. @param {string} value */
 export const modeOf = (value) => value.split(":")[0];

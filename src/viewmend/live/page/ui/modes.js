@@ -18,15 +18,17 @@ export const MODES = {
   points: "Points",
 };
 
-/** The server's model. */
-let model = MODES.completed;
+/** The name of a completed view next to those of other models. @param {string} model */
+const completedBy = (model) => `${MODES.completed} (${model})`;
+/** The name of the completed view: with the server's model, once it is known. */
+let completed = MODES.completed;
 /** Of what is shown on one side of the divider. @param {string} value */
 const nameOf = (value) =>
-  ({ ...MODES, completed: model, original: "Original", error: "Error map", compared: value.slice("compared:".length) })[modeOf(value)] ?? value;
+  ({ ...MODES, completed, original: "Original", error: "Error map", compared: completedBy(value.slice("compared:".length)) })[modeOf(value)] ?? value;
 
 /** What can be compared, once the server said which models it has. @param {Settings} settings @param {string} own model's name @param {string[]} models the others */
 export function offerModels(settings, own, models) {
-  model = own;
+  completed = completedBy(own);
   const others = [...models.map((name) => `compared:${name}`), "original", "error"];
   for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
     const list = byId(`split-${side}`);
@@ -99,7 +101,7 @@ export function nameSides(settings, shownMode) {
   for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
     const wanted = settings.get(side);
     const isThere = shownMode(modeOf(wanted)) === modeOf(wanted);
-    const text = isThere ? nameOf(wanted) : `${nameOf("completed")} (${nameOf(wanted).toLowerCase()}: only at a camera)`;
+    const text = isThere ? nameOf(wanted) : `${MODES.completed} (${nameOf(wanted).toLowerCase()}: only at a camera)`;
     const label = byId(`${side}-name`);
     if (label.textContent !== text) label.textContent = text;
   }
