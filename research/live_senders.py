@@ -38,8 +38,9 @@ def make(folder: Path, cameras: int) -> None:
         seed=10021, cameras=cameras, frames=FRAMES, size_px=SIZE_PX, background="stage", fps=float(FPS)
     )
     studio = Studio(config)
-    assert studio._backdrop is not None
-    plates = (255 * srgb_from_linear(studio._backdrop)).round().byte().permute(0, 2, 3, 1).numpy()
+    backdrop = studio.backdrop()
+    assert backdrop is not None
+    plates = (255 * srgb_from_linear(backdrop)).round().byte().permute(0, 2, 3, 1).numpy()
     for name, plate in zip(studio.cameras.names, plates, strict=True):
         write_image(folder / f"plates/{name}.png", plate)
     videos = [_video(folder / f"{name}.mp4") for name in studio.cameras.names]

@@ -82,6 +82,15 @@ def test_scenes_follow_from_their_numbers_and_need_enough_holes():
     assert all(int((s.view.missing > 0).sum()) >= SAMPLING.min_hole_px for s in first)
 
 
+def test_rigs_of_few_cameras_are_mixed_in_and_give_no_mask():
+    config = replace(SCENES, few_cameras_fraction=1.0, protocols=("target-mask",))
+    samples = SharedRigScenes(config, SAMPLING, "0").scene(1)
+    assert samples
+    assert all(sample.view.target_mask is None for sample in samples)
+    given = SharedRigScenes(replace(config, few_cameras_fraction=0.0), SAMPLING, "0").scene(1)
+    assert all(sample.view.target_mask is not None for sample in given)
+
+
 def test_clips_and_test_people_are_refused():
     with pytest.raises(ValueError, match="clips"):
         SharedRigScenes(SCENES, replace(SAMPLING, clip_length=2), "0")

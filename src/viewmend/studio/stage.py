@@ -104,8 +104,7 @@ class Studio:
         self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
         """The calibration of the capture, including its errors."""
         self._lights = stage_lights(light_seed)
-        on_stage = config.background == "stage"
-        self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed) if on_stage else None
+        self._backdrops: dict[str, Tensor] = {}
         # Cache of the last frame, since a frame and its ground truth are read in pairs.
         self._last_surface: tuple[int, Surface] | None = None
         self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
@@ -139,10 +138,21 @@ class Studio:
         self._check_time(time)
         names = self.cameras.names if names is None else tuple(names)
         numbers = self._numbers(names)
-        backdrop = None if self._backdrop is None else self._backdrop[numbers]
-        frame = self._draw(self.true_cameras.select(names), time, backdrop)
-        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, backdrop, numbers)
+        behind = self.backdrop(names)
+        frame = self._draw(self.true_cameras.select(names), time, behind)
+        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, behind, numbers)
         return replace(frame, cameras=self.cameras.select(names))
+
+    def backdrop(self, names: Sequence[str] | None = None) -> Float[Tensor, "view 3 height width"] | None:
+        """The stage behind the subject in the images of these cameras, or of all: linear light; None for black."""
+        if self.config.background != "stage":
+            return None
+        names = self.cameras.names if names is None else names
+        for name in names:
+            if name not in self._backdrops:
+                camera = self.true_cameras.select([name])
+                self._backdrops[name] = stage_backdrop(camera, self._backdrop_seed)[0]
+        return torch.stack([self._backdrops[name] for name in names])
 
     def silhouettes(self, time: int, names: Sequence[str]) -> Silhouettes:
         """Draw the masks of some cameras at index `time`, equal to those of `read`, at a fifth of the cost.
@@ -173,7 +183,7 @@ class Studio:
         the view on black. With `on_stage`, and a stage, they include what is behind soft pixels, as
         in the images of real cameras.
         """
-        if on_stage and self._backdrop is not None:
+        if on_stage and self.config.background == "stage":
             return self._draw(cameras, time, stage_backdrop(cameras, self._backdrop_seed))
         frame = self._draw(cameras, time, None)
         assert frame.mask is not None, "the studio draws masks"

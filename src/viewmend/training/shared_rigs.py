@@ -25,6 +25,10 @@ HELD_FRACTION = 1 / 4
 """Fraction of a rig's cameras that are held out together; the others carve the hull of all of them."""
 
 
+FEW_CAMERAS = (8, 16)
+"""Smallest and largest number of cameras in rigs of few cameras, whose hulls are fat."""
+
+
 @dataclass(frozen=True)
 class WrongMasks:
     """How some given masks M_t differ from the truth, as predicted ones do."""
@@ -69,10 +73,13 @@ class SharedRigScenes:
     def scene(self, number: int) -> list[Sample]:
         """The samples of rig `number`: those of its held-out cameras whose views have enough holes."""
         random = Random(f"{self.seed}/{number}")
-        studio = Studio(random_studio(self.config, max(self.sampling.frames) + 1, random, self.split))
+        config = self.config
+        if config.few_cameras_fraction and random.random() < config.few_cameras_fraction:
+            config = replace(config, cameras=FEW_CAMERAS, rigs=("ring", "dome"), protocols=("strict",))
+        studio = Studio(random_studio(config, max(self.sampling.frames) + 1, random, self.split))
         whole_window = random.random() < self.sampling.window_fraction
         times = self.sampling.frames if whole_window else self.sampling.frames[-1:]
-        return _SharedRig(studio, self.config, self.sampling, random).samples(times)
+        return _SharedRig(studio, config, self.sampling, random).samples(times)
 
 
 @dataclass(frozen=True)
