@@ -198,3 +198,20 @@ def test_letters_that_the_output_cannot_show_are_escaped(encoding):
         shown.encode("ascii", "backslashreplace").decode()
         == "カメラ Łódź ü".encode("ascii", "backslashreplace").decode()
     )
+
+
+@pytest.mark.parametrize("locale", ["C", "POSIX"])
+def test_names_are_utf8_in_every_locale(tmp_path, locale):
+    (tmp_path / "カメラ1").mkdir()
+    program = (
+        "import os, sys; from viewmend.cli import check, main; from viewmend.cli.console import show\n"
+        "check.run = lambda options: show(ascii([str(options.format), *os.listdir(options.capture)]), chr(252)) or 0\n"
+        "sys.exit(main())"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG"))}
+    environment |= {"LC_ALL": locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-c", program, "check", tmp_path, "--format", "カメラ1"]
+    done = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    names, letter = done.stdout.decode("ascii").splitlines()
+    assert names == ascii(["カメラ1", "カメラ1"]) and letter == "\\xfc"

@@ -8,7 +8,7 @@ import pytest
 from reference.films import SIZE, picture, write_film
 
 from viewmend.data.film_colours import BT2020, DISPLAY_P3, HLG, PQ, to_srgb
-from viewmend.data.video_clock import Track, match_tracks, timecode_s, video_track
+from viewmend.data.video_clock import Timecode, Track, match_tracks, parse_timecode, video_track
 from viewmend.data.videos import VideoFile, video_properties
 
 
@@ -86,12 +86,16 @@ def test_interlaced_films_show_one_field(tmp_path, order):
         ("nonsense", 25.0, None),
     ],
 )
-def test_timecodes_are_seconds(text, fps, expected):
-    assert timecode_s(text, fps) == (None if expected is None else pytest.approx(expected, abs=0.005))
+def test_timecodes_are_counts_of_frames(text, fps, expected):
+    found = parse_timecode(text, fps)
+    assert (None if found is None else found.frames / fps) == (
+        None if expected is None else pytest.approx(expected, abs=0.005)
+    )
 
 
-def clocked(camera, count, clock_s, kind="images"):
-    return Track(camera, kind, np.arange(count) / 30, 30.0, timecode_s=clock_s)
+def clocked(camera, count, clock_s, kind="images", fps=30.0):
+    timecode = None if clock_s is None else Timecode(round(30 * clock_s), 30)
+    return Track(camera, kind, np.arange(count) / fps, fps, timecode=timecode)
 
 
 def test_films_are_matched_by_timecode():
@@ -106,6 +110,19 @@ def test_films_are_matched_by_timecode():
 def test_timecodes_over_midnight_fit_together():
     clock = match_tracks([clocked("a", 30, 0.1), clocked("b", 39, 86399.8)])
     assert clock.frames["b", "images"][0] - clock.frames["a", "images"][0] == 9
+
+
+def test_masks_that_begin_after_midnight_keep_their_time():
+    images = clocked("a", 39, 86399.8)
+    clock = match_tracks([images, clocked("a", 30, 0.1, "masks"), clocked("b", 30, 0.1)])
+    assert not clock.moved
+    assert clock.frames["a", "images"][0] - clock.frames["a", "masks"][0] == 9
+
+
+def test_measured_rates_do_not_move_timecodes():
+    clock = match_tracks([clocked("a", 30, 39599.1, fps=29.98), clocked("b", 39, 39598.8, fps=29.99)])
+    assert clock.frames["b", "images"][0] - clock.frames["a", "images"][0] == 9
+    assert "they are matched by timecode" in clock.issues(["a", "b"])[0].text
 
 
 @pytest.mark.parametrize(("other_s", "text"), [(None, "'c' has none"), (5000.0, "no time at which all run")])
@@ -125,7 +142,7 @@ def test_the_timecode_of_a_film_is_read(tmp_path, name):
         frame.pts, frame.time_base = 0, Fraction(1, 25)
         film.mux(stream.encode(frame))
         film.mux(stream.encode(None))
-    assert video_track("a", "images", tmp_path / name).timecode_s == pytest.approx(39599.2)
+    assert video_track("a", "images", tmp_path / name).timecode == Timecode(39599 * 25 + 5, 25)
 
 
 def test_films_without_times_follow_the_others(tmp_path):

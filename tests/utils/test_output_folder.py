@@ -210,7 +210,7 @@ def test_a_report_that_was_killed_half_way_is_made_again(tmp_path):
     assert (out / "report.csv").read_text() == "mine"
 
 
-WITHOUT_LOCKS = [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EIO]
+WITHOUT_LOCKS = [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EIO, errno.EACCES]
 
 
 @pytest.mark.parametrize("code", WITHOUT_LOCKS, ids=errno.errorcode.get)

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from viewmend import __version__
-from viewmend.cli.console import escape_unencodable, exit_on_sigterm, say, show
+from viewmend.cli.console import escape_unencodable, exit_on_sigterm, say, show, use_utf8_names
 from viewmend.utils.logging import escaped_traceback, log_to_terminal
 
 ALIASES = {"info": "check"}
@@ -70,6 +70,8 @@ COMMANDS = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `viewmend` with these arguments (by default those of the process) and return the exit code."""
+    if argv is None:
+        use_utf8_names()
     escape_unencodable()
     with exit_on_sigterm():
         return _run(list(sys.argv[1:] if argv is None else argv))

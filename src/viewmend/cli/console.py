@@ -117,6 +117,20 @@ def say(message: str) -> None:
     print(printable(message), file=sys.stderr, flush=True)
 
 
+def use_utf8_names() -> None:
+    """Start this process again in Python's UTF-8 mode if names in its arguments and folders have another encoding.
+
+    In a locale such as C, names of files and arguments would not equal the same names in calibrations,
+    which are UTF-8. Standard output and error keep their encoding. Does nothing a second time.
+    """
+    is_utf8 = sys.getfilesystemencoding().lower().replace("-", "") == "utf8"
+    if is_utf8 or os.environ.get("PYTHONUTF8") == "1":
+        return
+    os.environ["PYTHONUTF8"] = "1"
+    os.environ.setdefault("PYTHONIOENCODING", sys.stdout.encoding)
+    os.execv(sys.executable, sys.orig_argv)
+
+
 def escape_unencodable() -> None:
     """Make standard output and error escape the characters that their encoding lacks.
 

@@ -33,6 +33,16 @@ TrackKind = Literal["images", "masks"]
 
 
 @dataclass(frozen=True)
+class Timecode:
+    """A recorder's clock, which counts frames."""
+
+    frames: int
+    """Frames since midnight."""
+    rate: int
+    """Frames in a second of the count, such as 30 for films of 29.97 frames per second."""
+
+
+@dataclass(frozen=True)
 class Track:
     """When the frames of a film were taken, or those of a camera's numbered images."""
 
@@ -46,7 +56,7 @@ class Track:
     """How far the camera's clock is ahead of the others'."""
     is_timed: bool = True
     """Whether the film stores its times; if not, they follow from an assumed rate."""
-    timecode_s: float | None = None
+    timecode: Timecode | None = None
     """The recorder's clock at the film's time 0; None if the film has no timecode."""
 
     @property
@@ -67,22 +77,24 @@ def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0)
         video = video_properties(path)
     except CaptureError as error:
         raise CaptureError(f"{path}: camera '{camera}': {str(error).removeprefix(f'{path}: ')}") from None
-    clock_s = None if video.timecode is None or video.fps is None else timecode_s(video.timecode, video.fps)
-    return Track(camera, kind, np.array(video.times_s), video.fps, offset_s, video.is_timed, clock_s)
+    timecode = None
+    if video.timecode is not None and video.fps is not None:
+        timecode = parse_timecode(video.timecode, video.fps)
+    return Track(camera, kind, np.array(video.times_s), video.fps, offset_s, video.is_timed, timecode)
 
 
-def timecode_s(text: str, fps: float) -> float | None:
-    """The seconds since midnight of a timecode, HH:MM:SS:FF, or with a semicolon in drop-frame counting; else None."""
+def parse_timecode(text: str, fps: float) -> Timecode | None:
+    """A timecode HH:MM:SS:FF, or with a semicolon in drop-frame counting, of a film of this rate; None for others."""
     parts = re.fullmatch(r"(\d+):(\d+):(\d+)([:;.,])(\d+)", text.strip())
     if parts is None:
         return None
     hours, minutes, seconds, frames = (int(parts[group]) for group in (1, 2, 3, 5))
-    nominal = round(fps)
+    rate = round(fps)
     minutes += 60 * hours
-    count = (60 * minutes + seconds) * nominal + frames
+    count = (60 * minutes + seconds) * rate + frames
     if parts[4] != ":":  # two numbers of each minute are skipped, except in every tenth minute
-        count -= 2 * round(nominal / 30) * (minutes - minutes // 10)
-    return count / fps
+        count -= 2 * round(rate / 30) * (minutes - minutes // 10)
+    return Timecode(count, rate)
 
 
 @dataclass(frozen=True)
@@ -323,7 +335,8 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
     All films of images need a timecode, and there has to be a time at which all of them run.
     """
     films = [track for track in tracks if track.kind == "images"]
-    starts = {track.camera: track.timecode_s for track in films if track.timecode_s is not None}
+    clocks_s = _clocks_s(tracks)
+    starts = {name: start_s for (name, kind), start_s in clocks_s.items() if kind == "images"}
     if len(starts) < 2:
         return tracks, None
     latest = max(starts.values())
@@ -346,14 +359,34 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
         return tracks, f"{differ}, and there is no time at which all run; films are taken to start together"
     moved = []
     for track in tracks:
-        own = track.timecode_s
-        from_s = shift[track.camera] if track.kind == "images" or own is None else own - starts[first]
+        from_s = shift[track.camera]
+        own_s = clocks_s.get((track.camera, track.kind))
+        if own_s is not None:  # of masks, which may start later than the images, and after midnight
+            late_s = own_s - clocks_s[track.camera, "images"]
+            from_s += (late_s + DAY_S / 2) % DAY_S - DAY_S / 2
         moved.append(replace(track, times_s=track.times_s + from_s))
     remove = "ffmpeg -i IN -map 0:v -c copy -write_tmcd 0 OUT"
     return (
         moved,
         f"{differ}; they are matched by timecode; if they were cut to start together, remove it ({remove})",
     )
+
+
+def _clocks_s(tracks: Sequence[Track]) -> dict[tuple[str, TrackKind], float]:
+    """The clock of each film with a timecode at its time 0, seconds since midnight.
+
+    Films that count alike run at one rate: the smallest difference of measured rates would
+    add up to seconds over the hours since midnight.
+    """
+    rates: dict[int, list[float]] = {}
+    for track in tracks:
+        if track.timecode is not None and track.fps:
+            rates.setdefault(track.timecode.rate, []).append(track.fps)
+    return {
+        (track.camera, track.kind): track.timecode.frames / float(np.median(rates[track.timecode.rate]))
+        for track in tracks
+        if track.timecode is not None and track.timecode.rate in rates
+    }
 
 
 def _nearest(

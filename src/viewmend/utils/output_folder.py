@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
+from uuid import uuid4
 
 import msgspec
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
@@ -175,7 +176,9 @@ def _acquire_lock(folder: Path) -> BaseFileLock:
             _warn_without_locks(folder, LOCK, "not implemented")
         return lock
     except Timeout:
-        raise ValueError(f"{in_use}, or choose another folder") from None
+        if _has_locks(folder):
+            raise ValueError(f"{in_use}, or choose another folder") from None
+        reason = "every lock is denied"
     except OSError as error:  # network file systems often have no locks
         reason = error.strerror or str(error)
     with contextlib.suppress(OSError):
@@ -188,6 +191,23 @@ def _acquire_lock(folder: Path) -> BaseFileLock:
         raise ValueError(f"{in_use}; if none is running, remove {path}; or choose another folder") from None
     _warn_without_locks(folder, MARKER, reason)
     return marker
+
+
+def _has_locks(folder: Path) -> bool:
+    """Whether a new file in the folder can be locked: some file systems deny all locks as if others held them."""
+    probe = folder / HIDDEN / f"{LOCK}-{uuid4().hex}"
+    lock = FileLock(probe)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a fallback, as when the folder itself was locked
+            lock.acquire(timeout=0)
+        lock.release()
+    except (Timeout, OSError):
+        return False
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+    return True
 
 
 def _warn_without_locks(folder: Path, marker: str, reason: str) -> None:
