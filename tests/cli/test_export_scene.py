@@ -1,6 +1,8 @@
 """`viewmend export-scene` from end to end on a small capture of a ball."""
 
 import importlib.util
+import json
+import shutil
 import sys
 from dataclasses import replace
 
@@ -154,6 +156,26 @@ def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
         assert main(["export-scene", str(folder), str(tmp_path / least), *given]) == 0
         counts.append((tmp_path / least / "points/000000.ply").stat().st_size)
     assert counts[0] > counts[1] + 1000
+
+
+def test_views_of_a_path_are_in_the_captures_world(folder, tmp_path, capsys):
+    far = np.array([412345.6, 4512345.6, 210.0])
+    moved = tmp_path / "far"
+    shutil.copytree(folder, moved)
+    content = json.loads((moved / "cameras.json").read_text())
+    pose = np.eye(4)
+    pose[:3, :3] = np.array(content["cameras"][0]["R"]).T
+    pose[:3, 3] = -pose[:3, :3] @ content["cameras"][0]["t"] + far
+    for camera in content["cameras"]:
+        camera["t"] = (np.array(camera["t"]) - np.array(camera["R"]) @ far).tolist()
+    content["bounds"] = content.get("bounds") and (np.array(content["bounds"]) + far).tolist()
+    (moved / "cameras.json").write_text(json.dumps(content))
+    (tmp_path / "path.json").write_text(json.dumps([pose.tolist()]))
+    given = ["--path", str(tmp_path / "path.json"), "--frames", "0:1", "--model", "telea"]
+    assert main(["export-scene", str(moved), str(tmp_path / "out"), *given]) == 0
+    assert "the scene's origin is at (" in capsys.readouterr().err
+    alpha = cv2.imread(str(tmp_path / "out/rgba/view000/000000.png"), cv2.IMREAD_UNCHANGED)[..., 3]
+    assert (alpha > 127).mean() > 0.05
 
 
 def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monkeypatch):

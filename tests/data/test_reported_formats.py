@@ -1,5 +1,6 @@
 """Faults that users of other tools reported in public: calibrations and folders that do not match one to one."""
 
+import json
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from reference import foreign_studios as studios
 from reference.ball import BallCapture, ring
 from reference.films import picture, write_film
 from reference.foreign_formats import write_colmap, write_easymocap
-from reference.foreign_images import write_agisoft
+from reference.foreign_images import write_agisoft, write_middlebury
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
@@ -60,6 +62,78 @@ def test_cameras_without_footage_are_left_out_and_named(tmp_path, caplog, format
         "no calibrated camera is not used: videos/witness.mp4" in caplog.text
         and "background" not in caplog.text
     )
+
+
+DATA_SETS = {
+    "actorshq": (studios.write_actorshq, "{}", "4x/rgbs/{}"),
+    "genebody": (studios.write_genebody, "{}", "image/{}"),
+    "mvhumannet": (studios.write_mvhumannet, "{}", "images/{}"),
+    "panoptic": (studios.write_panoptic, "00_{}", "hdImgs/{}"),
+    "dna": (studios.write_dna, "{}", None),
+}
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_cameras_of_data_sets_without_images_are_named(tmp_path, caplog, name):
+    write, names, images = DATA_SETS[name]
+    rig = [camera | {"name": names.format(f"{n + 10}")} for n, camera in enumerate(opencv(rig_of(4)))]
+    last = rig[-1]["name"]
+    if name == "mvhumannet":
+        rig = [camera | {"width": 512, "height": 375, "K": rig[0]["K"]} for camera in rig]
+    write(tmp_path, rig, ["0001", "0002"], gaps=[(last, "0001"), (last, "0002")])
+    if images is not None and name != "panoptic":
+        (tmp_path / images.format("stranger")).mkdir()
+    capture = open_capture(tmp_path)
+    assert len(capture.cameras) == 3 and last not in capture.cameras.names
+    assert f"cameras without footage are left out: {last}" in caplog.text
+    if images is not None and name != "panoptic":
+        assert re.search("no calibrated camera is not used: .*/stranger", caplog.text)
+
+
+def test_images_that_middlebury_and_riftcast_do_not_mention_are_named(tmp_path, caplog):
+    rig = [camera | {"name": str(n), "image": f"images/{n}.png"} for n, camera in enumerate(rig_of(4))]
+    (tmp_path / "middlebury").mkdir()
+    write_images(tmp_path / "middlebury", rig)
+    write_middlebury(tmp_path / "middlebury/rig_par.txt", opencv(rig)[:3])
+    assert len(open_capture(tmp_path / "middlebury").cameras) == 3
+    assert "does not mention are ignored: images/3.png" in caplog.text
+    studios.write_riftcast(tmp_path / "rift", rig, ["0001"])
+    path = tmp_path / "rift/calibration.json"
+    path.write_text(json.dumps({"cameras": json.loads(path.read_text())["cameras"][:3]}))
+    assert len(open_capture(tmp_path / "rift").cameras) == 3
+    assert "does not mention are ignored: frame_0001/rgb/rgb_3.jpeg" in caplog.text
+
+
+def test_footage_next_to_incomplete_files_of_opencv_is_named(tmp_path, caplog):
+    rig = rig_of(4)
+    write_opencv(tmp_path, opencv(rig))
+    for camera in rig:
+        write_film(tmp_path / f"{camera['name']}/video.mp4", [picture(n) for n in range(3)])
+    path = tmp_path / rig[3]["name"] / "config.xml"
+    path.write_text(path.read_text().replace("Rotation", "Unknown"))
+    assert len(open_capture(tmp_path).cameras) == 3
+    assert f"no calibrated camera is not used: {rig[3]['name']}" in caplog.text
+
+
+def test_a_second_calibration_is_named(tmp_path, caplog):
+    rig = rig_of(3)
+    for name in ("a.qca.txt", "b.qca.txt"):
+        write_qualisys(tmp_path / name, rig)
+    for camera in rig:
+        write_film(tmp_path / f"videos/{camera['name']}.mp4", [picture(n) for n in range(3)])
+    open_capture(tmp_path)
+    assert "a.qca.txt: this calibration is used, and not b.qca.txt" in caplog.text
+
+
+def test_chapters_next_to_a_thumbnail_are_named(tmp_path):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    for camera in rig:
+        for chapter in (1, 2):
+            write_film(tmp_path / f"videos/{camera['name']}/GX0{chapter}0042.MP4", [picture(chapter)])
+        Image.new("RGB", (64, 48)).save(tmp_path / f"videos/{camera['name']}/GX010042.jpg")
+    with pytest.raises(CaptureError, match=r"expected one video of camera .*GX010042.*GX020042"):
+        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize("names", ["{}/GX0{}0042.MP4", "{}_GX0{}0042.MP4"])

@@ -10,8 +10,7 @@ from viewmend.cli.checks import Geometry, Precision, PreparationOptions, check_l
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
+    from viewmend.data.prepare import PreparedCapture
     from viewmend.frame_cache import CachedFrame
     from viewmend.geometry.cameras import Cameras
 
@@ -86,7 +85,7 @@ def run(options: Options) -> int:
         log_preparation(capture)
         shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
         first = stream.add_frame(shown.to(options.device))
-        views = _views(options, first, capture.cameras, capture.up)
+        views = _views(options, first, capture)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
         more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}
         frames = track(frames, "exporting", len(times))
@@ -96,15 +95,19 @@ def run(options: Options) -> int:
         f"{options.out}: {written.frames} frames of {written.views} views; {written.vertices} vertices, "
         f"{written.points} points"
     )
+    if opened.origin_m.any():
+        origin = ", ".join(f"{value:.3f}" for value in opened.origin_m)
+        say(f"the scene's origin is at ({origin}) m of the capture, whose cameras are far from its origin")
     return 0
 
 
-def _views(options: Options, first: "CachedFrame", rig: "Cameras", up: "Tensor | None") -> "Cameras":
+def _views(options: Options, first: "CachedFrame", capture: "PreparedCapture") -> "Cameras":
     from viewmend.completed_cameras import place_around
     from viewmend.data.camera_path import read_camera_path
+    from viewmend.data.capture_folder import origin_of
     from viewmend.geometry.proxy import GeometryProxy
 
     if options.path is not None:
-        return read_camera_path(options.path, rig)
+        return read_camera_path(options.path, capture.cameras, origin_of(capture))
     assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
-    return place_around(rig, first.proxy.center, up, options.views)
+    return place_around(capture.cameras, first.proxy.center, capture.up, options.views)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from viewmend.data.formats.files import collect_footage, decode_text, invert_pose, to_rotation
+from viewmend.data.formats.files import collect_footage, decode_text, invert_pose, to_rotation, with_folders
 from viewmend.utils.untrusted_input import bounded_bytes
 
 COLUMNS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
@@ -29,7 +29,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         raise ValueError(
             f"expected a folder with one scale, got {', '.join(scales)}; open one of these folders"
         )
-    rows = [row for row in _read_table(file, COLUMNS) if (file.parent / "rgbs" / str(row["name"])).is_dir()]
+    table = {str(row["name"]): row for row in _read_table(file, COLUMNS)}
+    rows = [table[name] for name in with_folders(file.parent, "rgbs", table)]
     footage = collect_footage(file.parent, {str(row["name"]): f"rgbs/{row['name']}" for row in rows})
     entries = []
     for row in rows:

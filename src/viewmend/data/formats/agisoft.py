@@ -17,6 +17,7 @@ from viewmend.data.formats.files import (
     existing,
     files_like,
     find_mask,
+    first_of,
     listed,
     names_from_paths,
     read_xml,
@@ -36,12 +37,15 @@ UNSUPPORTED = ("k4", "p3", "p4")
 
 def find(folder: Path) -> Path | None:
     """The first XML file with a chunk of cameras."""
-    for path in files_like(folder, "*.xml"):
-        if path.stat().st_size <= MAX_BYTES:
-            data = path.read_bytes()
-            if b"<document" in data[:4096] and b"<chunk" in data:
-                return path
-    return None
+    return first_of(path for path in files_like(folder, "*.xml") if _has_chunk(path))
+
+
+def _has_chunk(file: Path) -> bool:
+    """Whether this is an export of Metashape that is not too large."""
+    if file.stat().st_size > MAX_BYTES:
+        return False
+    data = file.read_bytes()
+    return b"<document" in data[:4096] and b"<chunk" in data
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from viewmend.data.formats.files import (
     image_size_px,
     invert_pose,
     to_distortion,
+    warn_of_unmatched,
 )
 
 SUFFIX = ".smc"
@@ -54,6 +55,9 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     main, masks = (os.path.relpath(one.absolute(), folder) for one in (file, annotations))
     parameters = _parameters(annotations)
     masked = _camera_numbers(annotations, "Mask")
+    recorded = [camera for group in GROUPS for camera in sorted(_camera_numbers(file, group), key=int)]
+    without = [camera for camera in sorted(parameters, key=int) if camera not in recorded]
+    warn_of_unmatched(folder, without, [camera for camera in recorded if camera not in parameters])
     entries = []
     frames = set()
     for group in GROUPS:

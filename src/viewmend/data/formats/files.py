@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -137,15 +138,45 @@ def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -
 
 
 def warn_of_unused_images(folder: Path, used: Iterable[str]) -> None:
-    """Name the images in `images` that a calibration does not mention, by paths relative to the capture."""
-    place = folder / "images"
-    if not place.is_dir():
-        return
-    found = (path.relative_to(folder) for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    images = {path.as_posix() for path in found if not any(_is_hidden(part) for part in path.parts)}
-    unused = sorted(images - set(used))
+    """Name the images that a calibration does not mention, in `images` and next to those that it mentions.
+
+    Paths are relative to the capture.
+    """
+    known = {path for path in used if stays_inside(path)}
+    places = {folder / path for path in map(os.path.dirname, known)}
+    found = {path for place in places if place.is_dir() for path in place.iterdir()}
+    found |= set((folder / "images").rglob("*"))
+    images = {path.relative_to(folder) for path in found if path.suffix.lower() in IMAGE_SUFFIXES}
+    visible = {path.as_posix() for path in images if not any(_is_hidden(part) for part in path.parts)}
+    unused = sorted(visible - known)
     if unused:
         warn(f"{folder}: images that the calibration does not mention are ignored: {listed(unused)}")
+
+
+def warn_of_unmatched(folder: Path, cameras: Sequence[str], footage: Sequence[str]) -> None:
+    """Name the cameras of a calibration that have no footage, and the footage of no camera."""
+    if cameras:
+        warn(f"{folder}: cameras without footage are left out: {listed(cameras)}")
+    if footage:
+        warn(f"{folder}: footage of no calibrated camera is not used: {listed(footage)}")
+
+
+def with_folders(folder: Path, place: str, names: Iterable[str]) -> list[str]:
+    """The cameras that have a folder of images in `place`; names the others, and folders of no camera."""
+    calibrated = list(names)
+    found = _subfolders(folder / place)
+    absent = [name for name in calibrated if name not in found]
+    warn_of_unmatched(folder, absent, [f"{place}/{name}" for name in found if name not in calibrated])
+    return [name for name in calibrated if name in found]
+
+
+def first_of(calibrations: Iterable[Path]) -> Path | None:
+    """The first of these files, with a warning of the others; None if there is none."""
+    first, *others = [*calibrations, None]
+    unused = [path.name for path in others if path is not None]
+    if unused:
+        warn(f"{first}: this calibration is used, and not {listed(unused)}")
+    return first
 
 
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
@@ -271,13 +302,10 @@ def _found_footage(folder: Path, names: Sequence[str], paths: Sequence[str]) -> 
     match = _match_some(names, paths)
     if match.several:
         raise ValueError(_several_videos(match.several))
-    absent = [name for name in names if name not in match.paths]
-    if absent:
-        warn(f"{folder}: cameras without footage are left out: {listed(absent)}")
     used = set(match.paths.values())
-    unused = [path for path in paths if path not in used and "/" in path and not _without_subject(path)]
-    if unused:
-        warn(f"{folder}: footage of no calibrated camera is not used: {listed(unused)}")
+    others = [path for path in paths if path not in used and not _without_subject(path)]
+    unused = [path for path in others if "/" in path or is_video(path) or _has_footage(folder, path)]
+    warn_of_unmatched(folder, [name for name in names if name not in match.paths], unused)
     return collect_footage(folder, match.paths)
 
 
@@ -335,7 +363,7 @@ def _choose_videos(folder: Path, paths: dict[str, str]) -> dict[str, str]:
     several = {
         name: videos
         for name, videos in found.items()
-        if len(videos) > 1 and not list_images(folder, paths[name])
+        if len(videos) > max(1, _count_images(folder, paths[name]))
     }
     if several:
         raise ValueError(_several_videos(several))
@@ -384,6 +412,12 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
     clock = match_tracks(tracks)
     return Footage(tuple(f"{time:06d}" for time in range(clock.end)), clock.fps, entries)
+
+
+def _count_images(folder: Path, place: str) -> int:
+    """How many images a folder has; thumbnails of its videos count, too."""
+    images = list_images(folder, place)
+    return 0 if images is None else len(images.frames)
 
 
 def list_images(folder: Path, place: str) -> ImageList | None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from viewmend.data.formats.files import collect_footage, invert_pose, to_distortion
+from viewmend.data.formats.files import collect_footage, invert_pose, to_distortion, with_folders
 from viewmend.utils.safe_pickle import numbers, read_objects
 
 FPS = 15.0
@@ -22,7 +22,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     cameras = annotations.get("cams") if isinstance(annotations, dict) else None
     if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):
         raise ValueError("expected cameras by name in 'cams', got others; is it a file of GeneBody?")
-    used = {str(name): camera for name, camera in cameras.items() if (folder / "image" / str(name)).is_dir()}
+    named = {str(name): camera for name, camera in cameras.items()}
+    used = {name: named[name] for name in with_folders(folder, "image", named)}
     footage = collect_footage(folder, {name: f"image/{name}" for name in used})
     entries = []
     for name, camera in used.items():

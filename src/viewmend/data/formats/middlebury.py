@@ -3,7 +3,15 @@
 from pathlib import Path
 from typing import Any
 
-from viewmend.data.formats.files import decode_text, files_like, find_mask, image_size_px, names_from_paths
+from viewmend.data.formats.files import (
+    decode_text,
+    files_like,
+    find_mask,
+    first_of,
+    image_size_px,
+    names_from_paths,
+    warn_of_unused_images,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**22
@@ -13,7 +21,7 @@ NUMBERS = 21
 
 def find(folder: Path) -> Path | None:
     """The file of parameters."""
-    return next(iter(files_like(folder, "*_par.txt")), None)
+    return first_of(files_like(folder, "*_par.txt"))
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
@@ -35,4 +43,5 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         width, height = image_size_px(folder, place + words[0])
         entry = {"name": name, "width": width, "height": height, "K": rows[:3], "R": rows[3:6], "t": rows[6]}
         entries.append(entry | {"image": place + words[0], "mask": find_mask(folder, words[0])})
+    warn_of_unused_images(folder, [entry["image"] for entry in entries])
     return {"frames": ["0"], "cameras": entries}

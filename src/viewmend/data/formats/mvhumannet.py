@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from viewmend.data.formats.files import collect_footage, to_distortion
+from viewmend.data.formats.files import collect_footage, to_distortion, with_folders
 from viewmend.utils.safe_pickle import numbers, read_objects
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, typed
 
@@ -48,7 +48,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     full = next((size for known, size in CALIBRATED_PX.items() if abs(known - scale) < 1e-6), OTHER_PX)
     place = next((place for place in PLACES if (folder / place).is_dir()), PLACES[0])
     named = {key.rpartition("_")[2].rpartition(".")[0] or key: pose for key, pose in poses.items()}
-    used = {name: pose for name, pose in named.items() if (folder / place / name).is_dir()}
+    used = {name: named[name] for name in with_folders(folder, place, named)}
     footage = collect_footage(folder, {name: f"{place}/{name}" for name in used})
     entries = []
     for name, value in used.items():

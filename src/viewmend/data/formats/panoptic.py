@@ -5,7 +5,13 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from viewmend.data.formats.files import collect_footage, to_distortion
+from viewmend.data.formats.files import (
+    collect_footage,
+    files_like,
+    first_of,
+    to_distortion,
+    warn_of_unmatched,
+)
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, typed
 
 CENTIMETRES = 0.01
@@ -33,7 +39,7 @@ class _Calibration(Struct, kw_only=True):
 
 def find(folder: Path) -> Path | None:
     """The calibration."""
-    return next(iter(sorted(folder.glob("calibration_*.json"))), None)
+    return first_of(files_like(folder, "calibration_*.json"))
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
@@ -44,6 +50,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         paths = {name: path for name in entries if (path := _footage(folder, kind, name))}
         if len(paths) < 2:
             continue
+        warn_of_unmatched(folder, [name for name in entries if name not in paths], ())
         footage = collect_footage(folder, paths)
         result = []
         for camera in (entries[name] for name in paths):

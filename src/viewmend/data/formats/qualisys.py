@@ -6,7 +6,14 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from viewmend.data.formats.files import files_like, find_footage, folders_containing, read_xml, xml_attributes
+from viewmend.data.formats.files import (
+    files_like,
+    find_footage,
+    first_of,
+    folders_containing,
+    read_xml,
+    xml_attributes,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**20
@@ -19,7 +26,7 @@ MM_PER_M = 1000
 def find(folder: Path) -> Path | None:
     """The calibration, in the folder or in one with "calib" in its name."""
     files = (path for place in folders_containing(folder, "calib") for path in files_like(place, "*.qca.txt"))
-    return next(files, None)
+    return first_of(files)
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:

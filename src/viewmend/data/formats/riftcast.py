@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct
 
-from viewmend.data.formats.files import to_distortion
+from viewmend.data.formats.files import to_distortion, warn_of_unused_images
 from viewmend.data.images import RUN_LENGTH_SUFFIX
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, typed
@@ -100,6 +100,8 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     cameras = typed(read_json(bounded_bytes(folder / place)), _Calibration).cameras
     frames = _frames(folder, meta)
     entries = [_camera(folder, camera, frames) for camera in cameras]
+    if frames:
+        warn_of_unused_images(folder, [entry["image"].replace("{frame}", frames[0]) for entry in entries])
     result = {"first_pixel_center": [0.5, 0.5], "frames": frames, "cameras": entries}
     return result | (_meta_keys(meta) if meta else {})
 
