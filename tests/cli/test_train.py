@@ -54,6 +54,7 @@ def test_the_help_names_every_recipe(capsys):
     assert words >= set(RECIPES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["views", "paper"])
 def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, tmp_path, capsys):
     out = tmp_path / "mine"

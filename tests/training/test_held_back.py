@@ -99,6 +99,7 @@ def test_training_never_sees_what_is_held_back(balls):
     assert names == {"c0", "c1", "c2", "c4"}
 
 
+@pytest.mark.slow
 def test_what_is_held_back_is_scored(place):
     views = list(held_back_views(place, AUTO))
     assert {view.camera for view in views} == {"cam02"} and not any(view.trained_on for view in views)
@@ -116,6 +117,7 @@ def test_the_table_shows_the_subject_also_if_it_has_left(empty, tmp_path):
     assert len(views) == 5 and all(bool(view.truth.mask.any()) for view in views)
 
 
+@pytest.mark.slow
 def test_of_a_splits_file_the_last_frames_are_held_back(balls, tmp_path):
     captures = [shutil.copytree(balls / name, tmp_path / name) for name in TAKES]
     file = tmp_path / "splits.json"

@@ -67,6 +67,7 @@ def test_a_killed_run_resumes_from_a_whole_checkpoint(shards, tmp_path):
     assert killed == whole
 
 
+@pytest.mark.slow
 def test_two_processes_equal_one_with_two_streams(shards, tmp_path):
     assert started(tmp_path / "one", 4, shards, streams=2).wait() == 0
     two = started(tmp_path / "two", 4, shards, launcher=TORCHRUN)

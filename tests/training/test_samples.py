@@ -164,6 +164,7 @@ def test_training_refuses_test_data(tmp_path):
     assert isinstance(rig_source(replace(SCENES, performers=other, motions=other), (0,), "0"), StudioRigs)
 
 
+@pytest.mark.slow
 def test_samples_depend_neither_on_workers_nor_on_where_a_stream_resumes():
     source = studio_samples("7")
     alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))

@@ -360,6 +360,7 @@ def test_a_run_resumes_and_is_validated(tiny_views, tmp_path):
     assert len(losses[0]) == len(losses[1]) == 4 and losses[0][:2] == losses[1][:2]
 
 
+@pytest.mark.slow
 def test_captures_are_trained_on(capture, tmp_path):
     """Their held-out cameras are targets, without true depth; the card names them."""
     scenes = replace(VIEWS_SCENES, captures=(capture,), captures_fraction=1.0)
