@@ -31,7 +31,7 @@ BUSY_LOOP = "while True: pass"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).split("\n")[0])
     parser.add_argument("--models", nargs="+", default=list(MODELS))
     parser.add_argument("--sizes", nargs="+", default=list(SIZES), help="WIDTHxHEIGHT of cameras and views")
     parser.add_argument("--busy", nargs="+", type=int, default=[0, 2], help="numbers of busy processes")
