@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
@@ -26,34 +26,46 @@ from viewmend.data.video_clock import ABSENT, TrackKind, VideoClock
 from viewmend.data.videos import VideoFile, is_video, video_properties
 
 
+def colour_curves(coefficients: Float64[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "1 256 3"]:
+    """The corrected value of each channel for each value from 0 to 255; see `NativeCamera.colour`."""
+    powers = np.vander(np.arange(256.0), 3)
+    corrected = powers @ coefficients.T
+    return np.rint(corrected.clip(0, 255)).astype(np.uint8)[None]
+
+
 class CameraReader:
     """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe."""
 
     def __init__(self, folder: Path, camera: NativeCamera, frames: Sequence[str], clock: VideoClock | None):
         self.camera = camera
         self.rotation: Orientation | None = None
-        """How EXIF asks viewers to turn the camera's images, by the first one that was read."""
+        """How the EXIF of the first image that was read says to turn the camera's images."""
         self._rotation_is_known = False
         self.warned = False
         """Whether the user was warned of the rotation."""
         self._folder = folder
         self._frames = frames
         self._undistortion = Undistortion(camera)
-        paths = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
-        self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in paths)
-        curves = None if camera.colour is None else np.vander(np.arange(256.0), 3) @ camera.colour.T
-        self._curves = None if curves is None else np.rint(curves.clip(0, 255)).astype(np.uint8)[None]
-        numbers = np.arange(len(frames))
-        own = {} if clock is None else clock.frames
-        images = own.get((camera.name, "images"), numbers)
-        masks = images if camera.video is None or self._has_mask_per_image() else numbers
+        self._video = VideoFile(folder / camera.video) if camera.video else None
+        has_mask_video = camera.mask is not None and is_video(camera.mask)
+        self._mask_video = VideoFile(folder / str(camera.mask)) if has_mask_video else None
+        self._curves = None if camera.colour is None else colour_curves(camera.colour)
+
+        # Which image or mask belongs to each frame of the capture
+        in_order = np.arange(len(frames))
+        by_clock = {} if clock is None else clock.frames
+        images = by_clock.get((camera.name, "images"), in_order)
+        masks = images if camera.video is None or self._has_mask_per_image() else in_order
         self._index: dict[TrackKind, np.ndarray] = {
             "images": images,
-            "masks": own.get((camera.name, "masks"), masks),
+            "masks": by_clock.get((camera.name, "masks"), masks),
         }
 
     def _has_mask_per_image(self) -> bool:
-        """Whether numbered masks are those of the film's own frames, of which some of the capture's are missing."""
+        """Whether mask files are numbered like the film's frames, not like the capture's.
+
+        That is so if there are fewer mask files than frames of the capture, but as many as the film has frames.
+        """
         if self._video is None or self.camera.mask is None or self._mask_video is not None:
             return False
         count = sum((self._folder / self.camera.file("mask", frame)).is_file() for frame in self._frames)
@@ -139,9 +151,10 @@ class CameraReader:
     def _as_stored(
         self, mask: UInt8[np.ndarray, "rows columns"], path: Path
     ) -> UInt8[np.ndarray, "height width"]:
-        """A mask that lies as its image: another tool may have turned it as EXIF says, or not have turned it.
+        """The mask, turned as its image is stored.
 
-        A mask of the transposed size is turned back as the image's own EXIF says, or else as the mask's says.
+        The tool that made the mask may have turned it by the image's EXIF, or ignored it. A mask whose
+        width and height are swapped is turned back by the image's EXIF, or else turned by its own.
         """
         camera = self.camera
         if mask.shape != (camera.width, camera.height) or camera.width == camera.height:

@@ -19,10 +19,14 @@ from viewmend.geometry.rigid import is_rotation
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, shown, typed
 
 FORMAT = "plain-capture/1"
+"""The key `format` of a calibration has this value."""
 CALIBRATION = "cameras.json"
+"""The calibration of a capture is in a file of this name."""
 ROTATION_TOLERANCE = 1e-3
+"""The entries of R R^T may differ from the identity by this much: files hold rounded numbers."""
 FAR = 100.0
-"""Distance of a rig from its origin, relative to its extent, above which the origin is moved to the rig."""
+"""A rig is far from the file's origin if its distance is more than this many times its extent.
+The origin is then moved to the rig."""
 FileKind = Literal["image", "video", "mask", "depth"]
 FILE_KINDS: tuple[FileKind, ...] = ("image", "video", "mask", "depth")
 Text = Annotated[str, Meta(min_length=1)]
@@ -91,15 +95,8 @@ class _File(Struct, frozen=True, kw_only=True):
             raise _invalid(
                 "cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras"
             )
-        for key, names in (
-            ("frames", self.frames),
-            ("cameras", tuple(camera.name for camera in self.cameras)),
-        ):
-            repeated = sorted(name for name, count in Counter(names).items() if count > 1)[:5]
-            if repeated:
-                raise _invalid(
-                    key, "different names", f"{repeated} more than once", "rename or remove the duplicates"
-                )
+        _check_names_differ("frames", self.frames)
+        _check_names_differ("cameras", [camera.name for camera in self.cameras])
 
 
 @dataclass(frozen=True)
@@ -156,8 +153,8 @@ class NativeCalibration:
     folder: Path
     """The folder that the cameras' paths are relative to."""
     origin_m: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """The file's coordinates of this calibration's origin, which is near the cameras: 0 unless
-    these are far from the file's origin, as in survey coordinates."""
+    """The origin of this calibration, in the coordinates of the file. It is 0 unless the cameras
+    are far from the file's origin, as in survey coordinates: then it is a point near the cameras."""
 
 
 def read_calibration(folder: Path) -> NativeCalibration:
@@ -201,7 +198,7 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
 
 
 def _near_origin_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
-    """An origin near the cameras with round coordinates; 0 if the present one is near enough for 32-bit numbers."""
+    """Round coordinates near the cameras; 0 if these are near enough to the origin for 32-bit numbers."""
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
     extent_m = float((centers_m.max(0) - centers_m.min(0)).max())
@@ -212,7 +209,7 @@ def _near_origin_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
 
 
 def moved_to(calibration: NativeCalibration, origin_m: Float64[np.ndarray, "3"]) -> NativeCalibration:
-    """The same calibration with its origin at these coordinates of its file, computed in 64 bits."""
+    """The same calibration relative to another origin, which is given in the coordinates of the file."""
     step_m = origin_m - calibration.origin_m
     if not step_m.any():
         return calibration
@@ -235,14 +232,26 @@ def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: floa
     K[:2, 2] += shift_px
     R, t = exact_pose(np.array(entry.R), np.array(entry.t))
     return NativeCamera(
-        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms")},
-        **{kind: path and path.replace("\\", "/") for kind in FILE_KINDS for path in [getattr(entry, kind)]},
+        name=entry.name,
+        width=entry.width,
+        height=entry.height,
         K=K,
         R=R,
         t_m=t * scale,
         dist=np.array(entry.dist),
+        image=_with_slashes(entry.image),
+        video=_with_slashes(entry.video),
+        mask=_with_slashes(entry.mask),
+        depth=_with_slashes(entry.depth),
         colour=None if entry.colour is None else np.array(entry.colour),
+        mask_labels=entry.mask_labels,
+        offset_ms=entry.offset_ms,
     )
+
+
+def _with_slashes(path: str | None) -> str | None:
+    """The path with `/` between its parts, as it may have been written on Windows."""
+    return None if path is None else path.replace("\\", "/")
 
 
 def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
@@ -295,12 +304,23 @@ def _check_keys(content: dict[str, Any]) -> None:
 
 
 def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:
-    """Reject an unknown key that resembles a known key which is absent. Other unknown keys are ignored."""
-    absent = [key for key in known if key not in entry]
+    """Reject a misspelt key: one that is unknown and resembles a key that the entry lacks.
+
+    Other unknown keys are ignored.
+    """
+    absent = [key.lower() for key in known if key not in entry]
     for key in entry.keys() - set(known):
-        close = difflib.get_close_matches(key.lower(), [a.lower() for a in absent], n=1, cutoff=0.8)
+        close = difflib.get_close_matches(key.lower(), absent, n=1, cutoff=0.8)
         if close:
             raise _invalid(key, f"the key '{close[0]}'", f"'{key}'", "rename the key")
+
+
+def _check_names_differ(key: str, names: Sequence[str]) -> None:
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)[:5]
+    if repeated:
+        raise _invalid(
+            key, "different names", f"{repeated} more than once", "rename or remove the duplicates"
+        )
 
 
 def _invalid(key: str, expected: str, got: str, next_step: str) -> ValueError:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,7 +45,7 @@ async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
 
 @dataclass(frozen=True)
 class StateCauses:
-    """The inputs of a message `state`: as long as they stay the same, no new message is made."""
+    """What a message `state` depends on. While none of this changes, no message is made."""
 
     shared: SharedState
     clock_changes: int
@@ -52,13 +53,16 @@ class StateCauses:
 
 
 @dataclass(frozen=True)
-class StateContent:
-    """The part of a message `state` that a page cannot predict: as long as it stays the same, none is sent."""
+class UnpredictedState:
+    """The part of a message `state` that a page cannot compute from the last one.
+
+    While it stays the same, no message is sent.
+    """
 
     source: dict[str, Any]
     clock_changes: int
     own: dict[str, Any]
-    """The viewer's own fields, without those that its running clock changes."""
+    """The viewer's own fields, without those that change as its clock runs."""
 
 
 @dataclass
@@ -68,17 +72,17 @@ class SentMessages:
     rig: dict[str, Any] | None = None
     show: dict[str, Any] | None = None
     causes: StateCauses | None = None
-    state: StateContent | None = None
-    state_s: float = -STATE_S
-    """The time of the last message `state`."""
-    stats_s: float = -STATE_S
-    """The time of the last message `stats`."""
+    state: UnpredictedState | None = None
+    state_s: float = -math.inf
+    """The time of the last message `state`; -inf before the first."""
+    stats_s: float = -math.inf
+    """The time of the last message `stats`; -inf before the first."""
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     completed: int = 0
-    """The number of views that were completed ahead when messages `completed` were last sent."""
+    """`SharedState.completed` when messages `completed` were last sent."""
     completed_of: dict[FrameKey, int] = field(default_factory=dict)
-    """The number of completed views of each frame in the last message `completed` about it."""
+    """The number of completed views that each frame had then."""
 
 
 class ViewerConnection:
@@ -209,9 +213,11 @@ class ViewerConnection:
         if isinstance(message, Look) and message.codec not in codecs:
             raise ProtocolError(f"expected a codec among {codecs}, got '{message.codec}'")
         with self._service.lock:
-            is_known = self._update_session(message)
-            uses = [extension.handle(self._session, message) for extension in self._registry.extensions]
-            if not is_known and not any(uses):
+            session_uses = self._update_session(message)
+            extensions_use = [
+                extension.handle(self._session, message) for extension in self._registry.extensions
+            ]
+            if not session_uses and not any(extensions_use):
                 raise ProtocolError(
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
@@ -221,7 +227,7 @@ class ViewerConnection:
         self._registry.check_soon(self)
 
     def _update_session(self, message: Message) -> bool:
-        """Apply a message to the viewer's session, under the service's lock; False if sessions do not take its type."""
+        """Apply a message to the viewer's session, under the service's lock; False if it is for extensions."""
         match message:
             case Look():
                 self._session.look(message)
@@ -252,19 +258,20 @@ class ViewerConnection:
     def inform(self, shared: SharedState) -> float:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        Returns the time of the next call, which comes earlier if `shared` changes or the viewer
-        sends a message.
+        Returns the time from which it has to be called again, by the clock of the service. It is
+        called earlier if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
         self._send_new_rig()
 
-        # The position of a clock that catches up with a live edge cannot be predicted, nor can
-        # states of extensions.
+        # Two changes are not among the causes: a clock catches up with a live edge, or an extension
+        # has a new state.
         catches_up = self._service.source.span.live and session.clock.playing and not session.clock.live
-        always_changes = bool(self._registry.extensions) or catches_up
+        changes_by_itself = bool(self._registry.extensions) or catches_up
+        is_overdue = now - self._sent.state_s >= STATE_S
         causes = StateCauses(shared, session.clock_changes, session.buffering)
-        if causes != self._sent.causes or always_changes or now - self._sent.state_s >= STATE_S:
+        if causes != self._sent.causes or changes_by_itself or is_overdue:
             self._sent.causes = causes
             self._send_state(causes)
 
@@ -278,9 +285,12 @@ class ViewerConnection:
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
 
+        # If nothing changes by itself, the repeated state is due next. Otherwise the next check may
+        # find something to send.
         gets_views = session.wants_views or session.in_flight is not None or session.sent_since(now - 2)
-        is_steady = self._sent.viewers == shared.viewers and not always_changes and not gets_views
-        return self._sent.state_s + STATE_S if is_steady else now
+        is_steady = self._sent.viewers == shared.viewers and not changes_by_itself and not gets_views
+        next_check_s = now
+        return self._sent.state_s + STATE_S if is_steady else next_check_s
 
     def fail(self, error: Exception) -> None:
         """End the connection."""
@@ -288,23 +298,25 @@ class ViewerConnection:
             self._failed.set_exception(error)
 
     def _send_state(self, causes: StateCauses) -> None:
-        """Send a state, unless the page predicts it from the last one: its clock runs on."""
+        """Send a state, unless the page can compute it from the last one."""
         source = self._service.source
         now = self._now()
         with self._service.lock:
             own = self._session.state_json(source.span, self._service.edge)
         for extension in self._registry.extensions:
             own |= extension.state_json(self._session)
-        predicted = ("behind",) if source.span.live else ("time", "behind")  # a rig's frames are announced
+
+        # A page moves the clock of a recording by itself, but cannot know when a live rig's frames arrive.
+        predicted = ("behind",) if source.span.live else ("time", "behind")
         unpredicted = {key: value for key, value in own.items() if key not in predicted}
-        content = StateContent(causes.shared.source, causes.clock_changes, unpredicted)
-        if content != self._sent.state or now - self._sent.state_s >= STATE_S:
-            self._sent.state = content
+        state = UnpredictedState(causes.shared.source, causes.clock_changes, unpredicted)
+        if state != self._sent.state or now - self._sent.state_s >= STATE_S:
+            self._sent.state = state
             self._sent.state_s = now
             self._send_soon({"type": "state"} | causes.shared.source | own)
 
     def _send_completed(self) -> None:
-        """Say which completed views there are of each frame that has more, or others, than it had."""
+        """List the completed views of each frame whose number of them has changed."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
             if self._sent.completed_of.get(key) != count:
@@ -317,6 +329,7 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
+        # Statistics are about the last second, so they change until one second after the last frame.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now
@@ -330,7 +343,10 @@ class ViewerConnection:
             self._send_soon({"type": "rig"} | rig)
 
     def _send_soon(self, message: dict[str, Any], name: str | None = None) -> None:
-        """Queue a message; it replaces one of the same name, by default its type, that is still waiting."""
+        """Queue a message; one with the same name that is still waiting is replaced.
+
+        The name is the message's type by default.
+        """
         self._pending[name or message["type"]] = message
         self._wake_writer.set()
 

@@ -78,17 +78,23 @@ def train(
         FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is
             not, and the last checkpoint was kept.
     """
-    with join_processes() as processes, _claim(out) if processes.first else nullcontext():
-        run = Run(config, out, start, processes)
-        for progress in run.steps(stopped):
-            if report is not None and processes.first:
-                report(progress)
+    with join_processes() as processes:
+        claim = _claim(out) if processes.first else nullcontext()
+        with claim:
+            run = Run(config, out, start, processes)
+            for progress in run.steps(stopped):
+                if report is not None and processes.first:
+                    report(progress)
     return out
 
 
 @contextmanager
 def _claim(out: Path) -> Iterator[None]:
-    """Lock the folder for this run; ValueError if another run writes there, or it has other files and no checkpoint."""
+    """Lock the folder for this run.
+
+    Raises:
+        ValueError: another run writes there, or there are files that no run wrote.
+    """
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
@@ -118,14 +124,19 @@ class Processes:
         return Ddp(module, device_ids=devices, find_unused_parameters=True)
 
     def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
-        """The positions of all streams, in their order: stream n belongs to process n % count."""
+        """The positions of the streams of all processes, by the stream's number.
+
+        Stream n belongs to process n % count, so the first streams of all processes come first,
+        then their second ones.
+        """
         own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
         if self.count == 1:
             gathered = [own]
         else:
             gathered = [torch.empty_like(own) for _ in range(self.count)]
             torch.distributed.all_gather(gathered, own)
-        return tuple(ReplayPosition(*row.tolist()) for rows in zip(*gathered, strict=True) for row in rows)
+        by_number = torch.stack(gathered, 1).flatten(0, 1)
+        return tuple(ReplayPosition(*position) for position in by_number.tolist())
 
     def mean(self, value: Tensor) -> Tensor:
         """The mean over the processes."""
@@ -169,7 +180,7 @@ class RunClock:
     """The times of a run: how far it is, how fast, and when the next checkpoint is due."""
 
     def __init__(self, config: TrainConfig, step: int, elapsed_s: float) -> None:
-        """`step` steps were done before, in `elapsed_s`."""
+        """Start the clock of a run whose earlier parts made `step` steps in `elapsed_s`."""
         self.config = config
         self.first_step = step
         self.before_s = elapsed_s
@@ -183,8 +194,11 @@ class RunClock:
 
     def progress(self, step: int) -> float:
         """Fraction of the run that is done before `step`, by steps or by time, whichever is further."""
-        minutes = self.config.minutes
-        return max(step / self.config.steps, self.elapsed_s() / 60 / minutes if minutes else 0.0)
+        by_steps = step / self.config.steps
+        if not self.config.minutes:
+            return by_steps
+        by_time = self.elapsed_s() / (60 * self.config.minutes)
+        return max(by_steps, by_time)
 
     def checkpoint_due(self) -> bool:
         """Whether `checkpoint_minutes` have passed since the last checkpoint."""
@@ -233,7 +247,7 @@ class Run:
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = self.objective.make_optimizer(self.trained, config.learning_rate)
         self.adversary = self.objective.adversary
-        self.state = RunState(0, 0.0, ())
+        self.state = RunState(step=0, elapsed_s=0.0, positions=())
         self.validated: dict[str, float | None] = {}
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
@@ -253,16 +267,14 @@ class Run:
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
         config = self.config
-        clock = RunClock(self.config, self.state.step, self.state.elapsed_s)
-        with Log(self.out, self.state.step, self.processes.first) as log:
-            step = first = self.state.step
-            if (
-                step == 0
-                and self.validation is not None
-                and (self.keeps_best or self.objective.compares_seen)
-            ):
-                # The weights that the run starts from are kept if none are better, and later gains
-                # are over theirs.
+        first = self.state.step
+        step = first
+        clock = RunClock(config, first, self.state.elapsed_s)
+        with Log(self.out, first, self.processes.first) as log:
+            # The starting weights are scored if they may be kept as the best, or if gains over them
+            # are reported.
+            compares_start = self.keeps_best or self.objective.compares_seen
+            if step == 0 and self.validation is not None and compares_start:
                 self._validate(log, step)
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
@@ -294,7 +306,7 @@ class Run:
             if step > self.state.step:
                 self._save(step, clock)
             elif self.processes.first and not self.keeps_best:
-                self._write_model()  # it may be lost or damaged, and a finished run does nothing else
+                self._write_model()  # the run was finished before; the model's file may be lost
             if self.validation is not None and step > first and step % config.validate_every:
                 self._validate(log, step)
 
@@ -409,8 +421,8 @@ class Run:
             )
         if self.state.positions and len(self.state.positions) != count:
             raise ValueError(
-                f"expected the {len(self.state.positions)} streams that the run began with, got {count}; start as many "
-                "processes as then"
+                f"expected the {len(self.state.positions)} streams of the earlier part of the run, "
+                f"got {count}; start the same number of processes again"
             )
         streams = []
         for number in range(processes.rank, count, processes.count):
@@ -439,9 +451,9 @@ class Run:
 
 
 def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:
-    """How much more a model has gained since its first validation on seen views than on unseen ones, dB.
+    """The model's gain on seen views minus its gain on unseen views, dB; None if a score is missing.
 
-    None if a score is missing.
+    Gains are relative to the scores of the first validation.
     """
     gains = []
     for name in ("holes_seen", "holes"):
@@ -454,9 +466,9 @@ def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, fl
 
 
 def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
-    """The config with `auto` as the precision that suits the device.
+    """The config with a definite precision: the device's faster one replaces `auto`.
 
-    It is not stored, because a run may be resumed on another machine.
+    The run's files keep `auto`, because the run may be resumed on another machine.
     """
     if config.precision != "auto":
         return config
@@ -464,7 +476,10 @@ def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """Moves averages towards the weights by 1 - decay, faster at first, so that the initial weights are forgotten."""
+    """The update rule of the averaged weights: in each step they move towards the weights by 1 - decay.
+
+    They move faster in the first steps, so that the initial weights do not stay in the average.
+    """
 
     @torch.no_grad()
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], count: Tensor | int) -> None:

@@ -13,7 +13,7 @@ ABSENT_S = 0.5
 PHASE_GAIN = 0.05
 """Each group moves the ticks by this fraction of its cameras' median offset."""
 ALL_WANTED_RATIO = 1.5
-"""All images are wanted of a camera whose rate is below this many times the rate of the ticks."""
+"""A camera is fast if it takes at least this many images per tick. Not all of its images are used."""
 MAX_COMPLETE = 4
 """This many complete groups are kept until they are taken; the oldest are dropped."""
 
@@ -71,11 +71,14 @@ class Aligner:
         self._last_tick: dict[str, float] = dict.fromkeys(names, -math.inf)
         """The last tick for which each camera sent an image."""
         self._heard_s: dict[str, float] = dict.fromkeys(names, -math.inf)
-        """When each camera was heard of last."""
+        """When the last image of each camera arrived."""
         self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def wants(self, taken_s: float, period_s: float) -> bool:
-        """Whether an image may be used: of a camera much faster than the ticks, only the nearest to each tick is."""
+        """Whether an image may be used. Of a fast camera, only the nearest image to each tick is used.
+
+        `period_s` is the time between two images of the camera.
+        """
         if self._interval_s < ALL_WANTED_RATIO * period_s:
             return True
         return abs(self._nearest(taken_s).offset_s) <= period_s / 2

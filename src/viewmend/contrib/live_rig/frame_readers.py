@@ -26,7 +26,8 @@ SILENT_S = 1.0
 LATE_S = 0.1
 """Images of a recording that are overdue by this many seconds are skipped."""
 WAITED_S = 0.002
-"""A packet for which the reader waited at least this many seconds was not in a queue."""
+"""A packet for which the reader waited longer than this many seconds was not in a queue. So the time
+of its arrival is known."""
 DAMAGED_S = 2.0
 """Images after a damaged one are dropped until the next key frame, but no longer than this many seconds."""
 FFMPEG_OPTIONS = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
@@ -54,10 +55,10 @@ class Playback:
     def __init__(self, length_s: float = 1.0) -> None:
         self.start_s = time.monotonic()
         self.length_s = length_s
-        """All recordings start again after these seconds: at the end of the shortest."""
+        """The length of a lap, after which all recordings start again: that of the shortest recording."""
         self.shifts_s: dict[str, float] = {}
-        """Added to the times in each recording, so that the earliest one starts at 0. A camera that
-        is not listed here starts at 0 by itself."""
+        """Seconds to add to the times in a camera's recording. The first image of all of them is then
+        at 0. A recording that is not listed is played alone, from its first image."""
 
     def follow(self, tracks: Sequence[Track]) -> None:
         """Play these recordings by their own times.
@@ -88,7 +89,7 @@ def read_pictures(
     `wait(seconds)`, which returns True to end them.
 
     Raises:
-        OSError: it cannot be opened, ends, or is silent.
+        OSError: the camera cannot be opened, its stream ends, or it is silent.
     """
     return _play_recording(camera, playback, wait) if camera.is_file else _receive_stream(camera, counts)
 
@@ -136,7 +137,7 @@ def _play_recording(
     shift_s = playback.shifts_s.get(camera.name, -video.times_s[0])
     times_s = [time_s + shift_s for time_s in video.times_s]
 
-    # the first lap is joined in its middle
+    # Begin where the other recordings are now, in the middle of a lap
     now_s = time.monotonic()
     lap_s = playback.lap_start_s(now_s)
     position_s = now_s - lap_s

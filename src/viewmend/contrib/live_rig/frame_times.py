@@ -49,7 +49,8 @@ class SenderTimes(ArrivalTimes):
         super().__init__()
         self._clock = SenderClock()
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """Arrivals of the packets that FFmpeg still delays; None where the reader did not wait."""
+        """Arrivals of the last packets, which FFmpeg still delays; None for one from a queue, whose
+        arrival is unknown."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ArrivalTimes.add_packet`."""

@@ -138,11 +138,10 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
         raise CaptureError(
             f"{path}: expected a rig's TOML file, got: {error.strerror}; check the path"
         ) from None
-    except ValueError as error:  # of bytes, of TOML, of keys and values
-        what = (
-            f"expected TOML, got something else: {error}" if isinstance(error, UnicodeError) else str(error)
-        )
-        raise CaptureError(f"{path}: {what.rstrip('.')}") from None
+    except UnicodeError as error:
+        raise CaptureError(f"{path}: expected TOML, got something else: {error}") from None
+    except ValueError as error:  # wrong TOML, or a wrong key or value
+        raise CaptureError(f"{path}: {str(error).rstrip('.')}") from None
     folder = path.resolve().parent
     calibration = _calibration(folder / rig.calibration, rig.format)
     known = {camera.name: camera for camera in calibration.cameras}
@@ -167,12 +166,13 @@ def _calibration(place: Path, format: str | None) -> NativeCalibration:
     """The calibration of a folder of any format, or of a file in one.
 
     Raises:
-        CaptureError: there is none, or another file of the folder would be read.
+        CaptureError: there is none, or `place` is a file and the readers would use another one next to it.
     """
     if not place.is_file():
         return read_any_calibration(place, format)
     found = read_any_calibration(place.parent, format)
-    if found.file.resolve() != place.resolve() and place.suffix == found.file.suffix and format is None:
+    is_other_file = found.file.resolve() != place.resolve() and found.file.suffix == place.suffix
+    if is_other_file and format is None:
         raise CaptureError(
             f"{place}: expected the folder's calibration, which is {found.file.name}; name the format"
         )

@@ -83,7 +83,8 @@ class RigFileSource(LiveSource):
         self._tighten_masks = tighten_masks
         self._cameras_lock = threading.Condition()
         self._playback = Playback()
-        self._aligner = Aligner((), 1.0, 1.0, 1.0)
+        self._aligner = Aligner(names=(), interval_s=1.0, tolerance_s=1.0, wait_s=1.0)
+        """No camera's images, until `_switch_to` replaces it."""
         self._workers: dict[str, CameraWorker] = {}
         self._new_workers: list[CameraWorker] = []
         """Workers that `_begin_rig` starts."""
@@ -128,7 +129,8 @@ class RigFileSource(LiveSource):
         Raises:
             CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
         """
-        # Workers of unchanged cameras are kept. Cameras hold arrays, so their texts are compared.
+        # Workers of unchanged cameras are kept. Cameras hold arrays, which == does not compare as a
+        # whole, so their representations are compared.
         unchanged = {repr(camera) for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}

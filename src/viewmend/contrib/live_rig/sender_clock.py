@@ -4,9 +4,11 @@ from collections import deque
 from dataclasses import dataclass
 
 WINDOW_S = 10.0
-"""The least delayed packet of these seconds sets the clock; clocks drift by less than 1 ms in them."""
+"""The least delayed packet of the last this many seconds sets the clock. Clocks drift apart by less
+than 1 ms in that time."""
 JUMP_S = 1.0
-"""A sender has restarted if its timestamps jump by this many seconds more or less than the elapsed time."""
+"""A sender has restarted if its timestamps go back by more than this many seconds, or forward by this
+much more than the elapsed time."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,8 @@ class SenderClock:
 
     def __init__(self) -> None:
         self._candidates: deque[Arrival] = deque()
-        """Packets that are or may become the least delayed of the window; arrivals and offsets increase."""
+        """The least delayed packet of the window, then those that may replace it later. Arrivals and
+        offsets increase."""
         self._last: Arrival | None = None
 
     def add_packet(self, sent_s: float, arrived_s: float) -> None:

@@ -85,7 +85,7 @@ class CameraWorker:
         self.up = False
         """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why not, or what is wrong with its images."""
+        """Why the camera delivers no images, or what is wrong with them; None if all is well."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
         self._connect = connect
@@ -94,7 +94,9 @@ class CameraWorker:
         self._since_s = time.monotonic()
         """When `up` changed last."""
         self._last_s: float | None = None
+        """When the last image was taken; None before the first."""
         self._period_s = 0.0
+        """The estimated time between two images; 0 before the second."""
         self._newest: Queue[Picture] = Queue(1)
         """The newest image, until it is taken."""
         self._stopped = threading.Event()
@@ -201,8 +203,8 @@ class CameraWorker:
         if not self._wants(picture.taken_s, self._period_s):
             self.counts["thinned"] += 1
             return
-        with contextlib.suppress(Empty):  # one that was not taken is replaced
-            self._newest.get_nowait()
+        with contextlib.suppress(Empty):
+            self._newest.get_nowait()  # drop an image that was not masked yet
             self.counts["replaced"] += 1
         self._newest.put(picture)
 

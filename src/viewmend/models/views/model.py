@@ -2,10 +2,11 @@
 
     source cameras -> ray samples -> aggregation -> depth distribution -> blending -> prediction
 
-At half the resolution, samples at fixed offsets behind the proxy are taken along every ray, from
-the source cameras that see it best, and aggregated over cameras. A U-Net over the view turns them
-into a distribution over depths, as networks on cost volumes do (MVSNet, ENeRF). At full resolution,
-the cameras are sampled again at the depth found, and blended. Blending softens the image, so detail
+At half the resolution, the image consists of cells of 2 x 2 pixels with one ray each. Samples at
+fixed offsets behind the proxy are taken along every ray, from the source cameras that see it best,
+and aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as
+networks on cost volumes do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the
+depth found, and blended. Blending softens the image, so detail
 is added: in each of two frequency bands, the network takes it from the blended colours, from one
 camera and from the rendered view, with learned gains for every pixel.
 """
@@ -60,26 +61,26 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
-"""The cameras of a cell are chosen by their prior weights at these z-depths behind the proxy, in
-subject sizes."""
+"""The cameras of a cell are those with the largest initial weights at these z-depths behind the
+proxy, in subject sizes."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """A cell of the U-Net has the channels of `ViewImage`, its relative depth, and whether it has a depth."""
 CANDIDATES = 4
-"""A pixel blends this many colours: the fields of `CandidateColours`."""
+"""A pixel blends this many colours: those in `CandidateColours`."""
 DETAILS = 3 * len(BAND_PX)
-"""A pixel has this many gains of detail: in each band those of the blended colours, of one camera,
-and of the guess."""
+"""A pixel has this many gains of detail. Each band has three: for the blended colours, for the most
+trusted camera, and for the guess."""
 INITIAL_GAIN = 0.3
 """The gain of the finest detail of the blended colours before training."""
 PIXEL_CHANNELS = 27
-"""The last convolutions get this many numbers per pixel, in addition to the features of the U-Net
-and the sample."""
+"""`pixel_inputs` has this many channels. The last convolutions also get features of the U-Net and
+of the pixel's sample."""
 OUTPUT_CHANNELS = (CANDIDATES, 1, 1, DETAILS)
 """The last convolutions give a score for each candidate colour, alpha, confidence, and gains of detail."""
 ALPHA_SLOPE = 4.0
-"""The cameras' mean mask, from -0.5 to 0.5, is added to the logit of alpha with this factor."""
+"""The cameras' mean mask, minus 0.5, is multiplied by this factor and added to the logit of alpha."""
 MIN_DETAIL_WEIGHT = 0.01
-"""A pixel outside the subject has at least this weight in the local means around which there is detail."""
+"""Detail is the difference from a local mean, in which every pixel has at least this weight."""
 MARGIN_PX = 16
 """A crop with this margin around the subject gives the same prediction as the whole view, pixels."""
 
@@ -106,7 +107,8 @@ class ViewImage(NamedTuple):
 
     def stacked(self) -> Float[Tensor, "7 height width"]:
         """All channels in one image."""
-        return torch.cat([self.guess, torch.stack(self[1:])])
+        planes = [self.mask, self.coloured, self.largest_weight, self.predicted]
+        return torch.cat([self.guess, torch.stack(planes)])
 
 
 class CandidateColours(NamedTuple):
@@ -125,7 +127,7 @@ class CandidateColours(NamedTuple):
 
     def stacked(self) -> Float[Tensor, "pixel 4 3"]:
         """The colours, in the order of their scores."""
-        return torch.stack(self[:CANDIDATES], 1)
+        return torch.stack([self.trusted, self.single, self.soft, self.guess], 1)
 
 
 class ViewSynthNet(Network):
@@ -159,11 +161,15 @@ class ViewSynthNet(Network):
         inputs = config.features + PIXEL_CHANNELS + config.sample_channels
         fine = config.fine_features
         last = nn.Conv2d(fine, sum(OUTPUT_CHANNELS), 3, padding=1)
+
+        # Before training, the only detail is the finest of the blended colours: the first gain is not 0
+        gains = slice(-DETAILS, None)
+        first_gain = -DETAILS
         with torch.no_grad():
             assert last.bias is not None
-            last.weight[-DETAILS:] = 0
-            last.bias[-DETAILS:] = 0
-            last.bias[-DETAILS] = INITIAL_GAIN
+            last.weight[gains] = 0
+            last.bias[gains] = 0
+            last.bias[first_gain] = INITIAL_GAIN
         self.blending = nn.Sequential(
             nn.Conv2d(inputs, fine, 3, padding=1),
             nn.ReLU(),
@@ -246,7 +252,7 @@ class ViewSynthNet(Network):
         SourceCameras.of(views, None, context)
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
-        """The margin that shows where the subject's outline is."""
+        """The margin around the subject with which a crop is predicted as the whole view is, pixels."""
         return MARGIN_PX
 
     @torch.no_grad()
@@ -254,18 +260,21 @@ class ViewSynthNet(Network):
     def step(
         self, view: IncompleteView, context: ContextProvider, state: State
     ) -> tuple[CompletedView, State]:
-        """Predicts the pixels with E > 0 on the proxy and its rim; those that `view.fade` marks only fade.
+        """Predicts the pixels with E > 0 on the proxy and its rim.
 
-        With a `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from
-        their surroundings. Predictions are steadied by the viewer's last view, which is `state`.
+        Pixels that `view.fade` marks as background are not predicted but attenuated. With a
+        `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their
+        surroundings. Predictions are steadied by the viewer's last view, which is `state`.
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
         fades = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # No camera is sampled
+        # At the lowest quality, holes are filled without the cameras
         if fraction == 0 and bool((where | fades).any()):
             return fallback_view(view, fades, self.coarse_guess(view, None, quick=True)), state
+
+        # Without a pixel to predict, or without a camera, the view is only attenuated
         sources = None
         if bool(where.any()):
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
@@ -274,7 +283,7 @@ class ViewSynthNet(Network):
         if sources is None:
             return fallback_view(view, fades), state
 
-        # The subject, or a part of it, is predicted
+        # Otherwise, the subject or a part of it is predicted
         quick = fraction is not None
         guess = self.coarse_guess(view, sources, quick)
         filled_by_rays = self.coarse is not None and not quick
@@ -302,13 +311,13 @@ class ViewSynthNet(Network):
         cameras = choose_cameras(choosing_rays, sources, RAY_VIEWS)
         rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(OFFSETS), cameras)
 
-        # The U-Net also gets the rendered view, and where the proxy is, also in cells that are not predicted
+        # Further inputs of the U-Net, in all cells: the rendered view, and the depth of the proxy
         front = nearest_depth(view.depth)
         relative = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
         cell_channels = torch.cat([means, relative[None], (front > 0)[None].to(means)])
 
-        # Scores of the hypotheses, by their samples and by their neighbourhood
+        # Scores of the hypotheses: one from each sample alone, and one from its neighbourhood
         with self.autocast():
             samples = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
@@ -383,7 +392,7 @@ class ViewSynthNet(Network):
     def _aggregate_pixels(
         self, samples: RaySamples, surface: SurfacePoints, distribution: DepthDistribution
     ) -> AggregatedSamples:
-        """Weighs the cameras at each pixel, beginning with the trust that they have in its cell."""
+        """Weighs the cameras at each pixel. Their initial weights are those that they have in its cell."""
         prior = distribution.samples.trust[surface.cell, surface.hypothesis]
         with self.autocast():
             return self.pixel_aggregator(samples, prior[:, None])
@@ -414,9 +423,13 @@ def amplify_detail(
     shape: torch.Size,
     magnification: float | Float[Tensor, ""],
 ) -> Float[Tensor, "pixel 3"]:
-    """The bands of detail of these images times their gains, summed; `mask` weighs the local means."""
+    """The detail of these images: their bands times the gains, summed over bands and images.
+
+    Detail is the difference from a local mean, in which pixels are weighted by `mask`.
+    """
     bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)
-    return (gains.unflatten(1, bands.shape[1:3])[..., None] * bands).sum((1, 2))
+    gain_of_image = gains.unflatten(1, bands.shape[1:3])[..., None]  # [pixel, band, image, 1]
+    return (gain_of_image * bands).sum((1, 2))
 
 
 def candidate_colours(
@@ -461,9 +474,10 @@ def pixel_inputs(
     image: ViewImage,
     pixels: Pixels,
 ) -> Float[Tensor, "pixel 27"]:
-    """The inputs of the last convolutions that no layer made, in the order that they were trained on.
+    """Colours, masks and statistics of each pixel: inputs of the last convolutions.
 
-    `mask` is the mean mask of the cameras on the surface, and `statistics` are those of the sample there.
+    Shipped weights depend on their order. `mask` is the cameras' mean mask on the surface, and
+    `statistics` are those of the sample there.
     """
     rows, columns = pixels.unbind(1)
     inputs = [
