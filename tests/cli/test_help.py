@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WITH_RECIPES = ("train", "make-dataset")
 NEGATIVE = ("do not ", "disable ", "skip ", "leave ", "ignore ", "never ", "without ")
 UNCHANGED = re.compile(r"(use|take|keep|show|write) .*\bas (it is|they are)\b")
-CASES = [c.name for c in COMMANDS if c.name not in WITH_RECIPES] + [
+CASES = [name for name in COMMANDS if name not in WITH_RECIPES] + [
     f"{c} {r}" for c in WITH_RECIPES for r in RECIPES
 ]
 

@@ -104,7 +104,7 @@ def unknown_options(command: str) -> list[str]:
     from viewmend.cli import COMMANDS
 
     words = [word.split("=")[0] for word in shlex.split(command, comments=True)]
-    names = {c.name for c in COMMANDS}
+    names = set(COMMANDS)
     length = next((n for n in (2, 1) if " ".join(words[:n]) in names), 0)
     if not length:
         return words[:1]

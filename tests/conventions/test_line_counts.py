@@ -10,7 +10,7 @@ CEILINGS = {
     "parallel": 2,
     "walruses": 30,
     "prepositions": 3,
-    "late_constants": 14,
+    "late_constants": 5,
     "statements": 2,
     "locals": 20,
 }

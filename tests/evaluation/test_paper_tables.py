@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from viewmend import cli
-from viewmend.cli import paper_table
+from viewmend.cli import evaluate_paper_table
 from viewmend.evaluation.paper_tables import (
     OURS,
     PaperRow,
@@ -134,4 +134,4 @@ def test_a_network_trained_from_scratch_is_not_called_fine_tuned(tmp_path, monke
         (folder / "README.md").write_text(
             f"Trained by `viewmend train dstt` from {start}: 9 steps in 81 minutes."
         )
-        assert paper_table._relabelled(row, None).label == label
+        assert evaluate_paper_table._relabelled(row, None).label == label

@@ -14,11 +14,11 @@ from viewmend.live.budget import (
     MEMORY_FRAMES,
     REFINE_LADDER,
     Budget,
-    QualityLevel,
     ResolutionLimit,
     ladder_for,
 )
 from viewmend.live.protocol import FrameTimes, Limits
+from viewmend.live.quality import QualityLevel
 from viewmend.models.classical import Telea
 from viewmend.models.paper.config import PAPER_TOP_K
 from viewmend.models.views.config import ViewsConfig

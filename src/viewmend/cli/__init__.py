@@ -17,7 +17,6 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from viewmend import __version__
 from viewmend.cli.console import escape_unencodable, exit_on_sigterm, say, show, use_utf8_names
@@ -26,46 +25,29 @@ from viewmend.utils.logging import escaped_traceback, log_to_terminal
 ALIASES = {"info": "check"}
 """Former names of commands. They still work, but the overview does not list them."""
 
-
-class Command(NamedTuple):
-    """A subcommand. Its name is one or two words; `weights get` is matched before `weights`."""
-
-    name: str
-    module: str
-    summary: str
-
-
-COMMANDS = (
-    Command("demo", "viewmend.cli.demo", "Render and inpaint a synthetic scene. Needs no data."),
-    Command("view", "viewmend.cli.view", "Open a capture in the browser."),
-    Command("serve", "viewmend.cli.serve", "Serve a capture or a live rig to browsers."),
-    Command("publish", "viewmend.cli.publish", "Write a capture as a web page of static files."),
-    Command("mend", "viewmend.cli.mend", "Render and inpaint novel views of a capture."),
-    Command("studio", "viewmend.cli.studio", "Generate synthetic captures with ground truth."),
-    Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
-    Command("make-dataset", "viewmend.cli.make_dataset", "Generate training samples in advance."),
-    Command("evaluate", "viewmend.cli.evaluate", "Compare methods on standard scenes and on captures."),
-    Command(
-        "evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."
-    ),
-    Command("weights", "viewmend.cli.weights", "List third-party weights."),
-    Command(
-        "weights get", "viewmend.cli.weights_get", "Download the networks of LPIPS (VGG16) and VFID (I3D)."
-    ),
-    Command("masks", "viewmend.cli.masks", "Make masks for a capture."),
-    Command(
-        "calibrate",
-        "viewmend.cli.calibrate",
-        "Calibrate cameras with a board, or refine them with silhouettes.",
-    ),
-    Command("splits", "viewmend.cli.splits", "Write a train/test split of captures."),
-    Command("convert", "viewmend.cli.convert", "Convert a capture of any supported format."),
-    Command(
-        "export-scene", "viewmend.cli.export_scene", "Export a capture for game engines: mesh, points, depth."
-    ),
-    Command("export", "viewmend.cli.export", "Export a model for C++ and other runtimes."),
-    Command("check", "viewmend.cli.check", "Check a capture, and describe it."),
-)
+COMMANDS = {
+    "demo": "Render and inpaint a synthetic scene. Needs no data.",
+    "view": "Open a capture in the browser.",
+    "serve": "Serve a capture or a live rig to browsers.",
+    "publish": "Write a capture as a web page of static files.",
+    "mend": "Render and inpaint novel views of a capture.",
+    "studio": "Generate synthetic captures with ground truth.",
+    "train": "Train a model, or fine-tune one on your own capture.",
+    "make-dataset": "Generate training samples in advance.",
+    "evaluate": "Compare methods on standard scenes and on captures.",
+    "evaluate paper-table": "Compute the paper's tables on your own data.",
+    "weights": "List third-party weights.",
+    "weights get": "Download the networks of LPIPS (VGG16) and VFID (I3D).",
+    "masks": "Make masks for a capture.",
+    "calibrate": "Calibrate cameras with a board, or refine them with silhouettes.",
+    "splits": "Write a train/test split of captures.",
+    "convert": "Convert a capture of any supported format.",
+    "export-scene": "Export a capture for game engines: mesh, points, depth.",
+    "export": "Export a model for C++ and other runtimes.",
+    "check": "Check a capture, and describe it.",
+}
+"""The summary of each command, in the order of the overview. The module of `make-dataset` is
+`make_dataset`, that of `weights get` is `weights_get`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,10 +66,10 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments[0] == "--version":
         show(f"viewmend {__version__}")
         return 0
-    by_name = {command.name: command for command in COMMANDS}
-    command = by_name.get(" ".join(arguments[:2])) or by_name.get(ALIASES.get(arguments[0], arguments[0]))
-    if command is None:
-        names = ", ".join(by_name)
+    two_words = " ".join(arguments[:2])
+    command = two_words if two_words in COMMANDS else ALIASES.get(arguments[0], arguments[0])
+    if command not in COMMANDS:
+        names = ", ".join(COMMANDS)
         return _fail(f"expected a command among {names}, got '{arguments[0]}'; see viewmend --help")
     for number, word in enumerate(arguments):
         if not word.strip() or re.fullmatch(r"--[\w-]+=\s*", word):
@@ -96,9 +78,9 @@ def _dispatch(arguments: list[str]) -> int:
     log_to_terminal()
     import tyro
 
-    arguments = arguments[len(command.name.split()) :]
-    module = importlib.import_module(command.module)
-    prog = f"viewmend {command.name}"
+    arguments = arguments[len(command.split()) :]
+    module = importlib.import_module(f"viewmend.cli.{re.sub('[ -]', '_', command)}")
+    prog = f"viewmend {command}"
     flags = (tyro.conf.FlagCreatePairsOff,)
     if hasattr(module, "parse"):
         options = module.parse(arguments, prog)
@@ -134,8 +116,8 @@ def _fail(message: str) -> int:
 
 
 def _overview() -> str:
-    width = max(len(command.name) for command in COMMANDS) + 2
-    commands = "\n".join(f"  {command.name:<{width}}{command.summary}" for command in COMMANDS)
+    width = max(map(len, COMMANDS)) + 2
+    commands = "\n".join(f"  {command:<{width}}{summary}" for command, summary in COMMANDS.items())
     return f"""usage: viewmend COMMAND [options]
 
 Free-viewpoint video of people from a few calibrated cameras, with its holes filled live.

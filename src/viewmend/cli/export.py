@@ -32,16 +32,15 @@ def run(options: Options) -> int:
     if not options.out.parent.is_dir():
         raise ValueError(f"{options.out.parent}: expected a folder to write to, found none; create it first")
     from viewmend.cli.console import busy, say
-    from viewmend.export.model import FORMATS, load_exportable, metadata, trace
+    from viewmend.export.model import check_format, load_exportable, metadata, trace, write_program
     from viewmend.utils.atomic_writes import remove_partial_file
 
-    check_packages, write = FORMATS[options.format]
-    check_packages()
+    check_format(options.format)
     net = load_exportable(options.model)
     remove_partial_file(options.out)
     with busy("tracing the model"):
         program = trace(net)
     with busy("compiling it" if options.format == "pt2" else "writing it"):
-        write(program, options.out, metadata(net, options.model))
+        write_program(program, options.out, options.format, metadata(net, options.model))
     say(f"wrote {options.out}: {options.out.stat().st_size / 1e6:.1f} MB")
     return 0

@@ -46,6 +46,16 @@ HEIF_REFUSED = (
     "the images to JPEG or PNG"
 )
 """Messages about HEIC images say this if the extra is not installed."""
+EXIF_ORIENTATIONS = (
+    (False, False, True),
+    (False, True, True),
+    (False, True, False),
+    (True, False, False),
+    (True, False, True),
+    (True, True, True),
+    (True, True, False),
+)
+"""The fields of `Orientation` for the values 2 to 8 of EXIF's orientation tag; 1 is upright."""
 RUN_LENGTH_SUFFIX = ".bin"
 """Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then
 the end of each run."""
@@ -94,18 +104,6 @@ class Orientation:
         return np.ascontiguousarray(stored.swapaxes(0, 1) if self.transposed else stored)
 
 
-ORIENTATIONS = {
-    2: Orientation(False, False, True),
-    3: Orientation(False, True, True),
-    4: Orientation(False, True, False),
-    5: Orientation(True, False, False),
-    6: Orientation(True, False, True),
-    7: Orientation(True, True, True),
-    8: Orientation(True, True, False),
-}
-"""The values of EXIF's orientation tag, except 1, which is upright."""
-
-
 def exif_orientation(path: Path) -> Orientation | None:
     """How EXIF asks viewers to turn the image; None if it does not, or if this is not an image."""
     small = cv2.IMREAD_REDUCED_COLOR_4
@@ -114,7 +112,8 @@ def exif_orientation(path: Path) -> Orientation | None:
     turned = cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
         return None
-    for orientation in ORIENTATIONS.values():
+    for transposed, flip_rows, flip_columns in EXIF_ORIENTATIONS:
+        orientation = Orientation(transposed, flip_rows, flip_columns)
         shown = orientation.apply(stored)
         if shown.shape == turned.shape and (shown == turned).all():
             return orientation

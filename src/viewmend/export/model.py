@@ -3,10 +3,11 @@
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,6 +19,8 @@ from viewmend.models.checkpoint import load_network, shipped_models
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.utils.atomic_writes import write_atomically
 
+Format = Literal["pt2", "onnx"]
+"""An AOTInductor package, or ONNX."""
 SMALLEST_PX = 64
 """Views and images have at least this many pixels along a side."""
 MAX_CAMERAS = 64
@@ -162,11 +165,24 @@ def write_onnx(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -
     write_atomically(path, lambda draft: made.save(draft, external_data=False), durable=True)
 
 
-FORMATS: dict[str, tuple[Callable[[], None], Callable[[ExportedProgram, Path, Mapping[str, str]], None]]] = {
-    "pt2": (check_compiler, write_pt2),
-    "onnx": (check_onnx, write_onnx),
-}
-"""Check of what each format needs, and its writer."""
+def check_format(format: Format) -> None:
+    """ValueError if this machine lacks what is needed to write the format."""
+    if format == "pt2":
+        check_compiler()
+    else:
+        check_onnx()
+
+
+def write_program(program: ExportedProgram, path: Path, format: Format, notes: Mapping[str, str]) -> None:
+    """Write a program in this format with its metadata.
+
+    Raises:
+        OSError: it cannot be written; then there is no file.
+    """
+    if format == "pt2":
+        write_pt2(program, path, notes)
+    else:
+        write_onnx(program, path, notes)
 
 
 @contextmanager

@@ -14,11 +14,12 @@ docs/live.md describes the ladders of quality levels. The control law of `Budget
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf, sqrt
 from statistics import median
 
 from viewmend.live.protocol import FrameTimes
+from viewmend.live.quality import Ladder, QualityLevel
 from viewmend.models.base import Inpainter
 
 MEMORY_FRAMES = 5
@@ -31,16 +32,6 @@ MAX_UP_AFTER_FRAMES = 256
 """Largest number of frames with room that a step up can need."""
 PROBATION_FRAMES = 12
 """A step up that is undone within this many frames was wrong."""
-COARSE_FILL_COST = 0.15
-"""Cost of a fill without context, relative to the full level."""
-REFINE_FIXED = 0.1
-"""Cost of refining that does not depend on resolution, relative to the full level."""
-REFINE_COST = 0.3
-"""Cost of refining an arbitrarily small part at full resolution, relative to the full level."""
-FADE_FIXED = 0.05
-"""Cost of fading background that does not depend on resolution, relative to the full level."""
-FADE_COST = 0.13
-"""Cost of fading background at full resolution, relative to the full level."""
 MAX_WAIT_S = 2.5
 """All viewers that wait for an image are predicted to be served within this time, one after the other."""
 IDLE_WAIT_S = 1.0
@@ -51,51 +42,8 @@ DEFAULT_S_PER_PX = 6e-6
 """Seconds per pixel at full quality before any measurement, as on a slow machine."""
 SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
 """Scales of the resolution, from the cheapest level up."""
-
-
-@dataclass(frozen=True)
-class QualityLevel:
-    """Quality settings of one view."""
-
-    scale: float
-    """Factor of width and height."""
-    context_times: int
-    """Number of context frames, the latest first; 0: no camera image is encoded."""
-    top_k: int | None
-    """Context tokens that survive pruning; None for the model's own number."""
-    refine_fraction: float | None = None
-    """Part of the subject that is inpainted; None for all that the error rule selects. 0 fades
-    background and fills holes from around them."""
-
-    @property
-    def relative_cost(self) -> float:
-        """Cost of inpainting, relative to the full level."""
-        if self.refine_fraction == 0:
-            return FADE_FIXED + self.scale**2 * FADE_COST
-        if self.refine_fraction is not None:
-            refined = (1 - REFINE_FIXED - REFINE_COST) * self.refine_fraction
-            return REFINE_FIXED + self.scale**2 * (REFINE_COST + refined)
-        tokens = min(self.top_k or 2048, 2048) / 2048
-        if self.context_times == 0:
-            return self.scale**2 * COARSE_FILL_COST
-        return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
-
-
-FULL = QualityLevel(1.0, 7, None)
-
-
-@dataclass(frozen=True)
-class Ladder:
-    """The quality levels for one kind of model."""
-
-    levels: tuple[QualityLevel, ...]
-    """All levels, from the cheapest to `FULL`."""
-    moving: QualityLevel
-    """The level of a moving view if there is no budget."""
-    still: QualityLevel
-    """The level of a view that has just come to rest: sharp and quickly rendered."""
-
-
+FULL = QualityLevel(scale=1.0, context_times=7, top_k=None)
+"""The highest level: everything that a model can do."""
 CONTEXT_LADDER = Ladder(
     (
         *(QualityLevel(scale, 0, 256) for scale in SCALES),
@@ -107,6 +55,7 @@ CONTEXT_LADDER = Ladder(
     moving=QualityLevel(0.5, 0, 256),
     still=QualityLevel(1.0, 0, None),
 )
+"""The ladder of models that inpaint holes by attention to context, from less to more context."""
 REFINE_LADDER = Ladder(
     (
         *(QualityLevel(scale, 7, None, 0.0) for scale in SCALES),
@@ -116,6 +65,7 @@ REFINE_LADDER = Ladder(
     moving=QualityLevel(1.0, 7, None, 0.0),
     still=QualityLevel(1.0, 7, None, 0.0),
 )
+"""The ladder of models that predict errors, from smaller to larger parts of the subject."""
 
 
 def ladder_for(inpainter: Inpainter) -> Ladder:

@@ -155,7 +155,7 @@ class ViewerConnection:
             "version": protocol.VERSION,
             "viewer": next(self._registry.numbers),
             "modes": protocol.MODES,
-            "error_rules": tuple(ERROR_RULES),
+            "error_rules": ERROR_RULES,
             "error_rule": self._service.renderer.error_rule,
             "background": self._service.renderer.background,
             "codecs": [codec for codec in about["codecs"] if codec in ("jpeg", *hello.codecs)],

@@ -10,11 +10,12 @@ from typing import Any
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.live.assets import FrameKey, frame_key
-from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLevel, ResolutionLimit
+from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, ResolutionLimit
 from viewmend.live.encoding import Encoders, encode_frame
 from viewmend.live.frame_source import Clock, Span
 from viewmend.live.poses import HomeView, view_camera
 from viewmend.live.protocol import COMPLETED_MODES, EXTRA_MODES, ClockChange, FrameTimes, Look
+from viewmend.live.quality import Ladder, QualityLevel
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
 

@@ -21,6 +21,11 @@ from viewmend.rendering.blending import Blend
 from viewmend.types import IncompleteView
 from viewmend.utils.plugins import load_from_file
 
+ErrorRule = Callable[["Evidence"], Float[Tensor, "height width"]]
+"""Computes E from the evidence, floats in [0, 1]: 1 on all pixels of the proxy where the
+blend has no colour."""
+ERROR_RULES = ("holes", "all", "predicted")
+"""The names of the rules that `error_rule` knows."""
 MIN_WEIGHT = 1e-5
 """A pixel has no colour if the sum of its raw weights is below this (RIFTCast)."""
 MIN_GAIN = 0.01**2
@@ -49,11 +54,6 @@ class Evidence:
     blend: Blend
 
 
-ErrorRule = Callable[[Evidence], Float[Tensor, "height width"]]
-"""Computes E from the evidence, floats in [0, 1]: 1 on all pixels of the proxy where the
-blend has no colour."""
-
-
 def holes(evidence: Evidence) -> Float[Tensor, "height width"]:
     """1 on the pixels of the proxy that no source view colours: the paper's E, with RIFTCast's threshold."""
     return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
@@ -64,13 +64,11 @@ def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:
     return F.max_pool2d(evidence.mask[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
 
 
-ERROR_RULES: dict[str, ErrorRule] = {"holes": holes, "all": all_covered, "predicted": all_covered}
-"""The rules by name. `predicted` starts from all covered pixels and keeps those with the highest
-predicted gain."""
-
-
 def error_rule(name: str) -> ErrorRule:
-    """The rule of this name: an entry of `ERROR_RULES`, or FILE.py:NAME, a function in a file of your own.
+    """The rule of this name: one of `ERROR_RULES`, or FILE.py:NAME, a function in a file of your own.
+
+    `predicted` starts from all covered pixels; `decide_error_mask` keeps those with the highest
+    predicted gain.
 
     Raises:
         ValueError: there is no such rule.
@@ -82,12 +80,13 @@ def error_rule(name: str) -> ErrorRule:
     """
     if ".py:" in name:
         return cast(ErrorRule, load_from_file(name))
-    if name not in ERROR_RULES:
+    rules: dict[str, ErrorRule] = {"holes": holes, "all": all_covered, "predicted": all_covered}
+    if name not in rules:
         raise ValueError(
             f"expected an error rule among {sorted(ERROR_RULES)}, got '{name}'; choose one of them, or name a function "
             "in a file of your own, FILE.py:NAME"
         )
-    return ERROR_RULES[name]
+    return rules[name]
 
 
 def decide_error_mask(

@@ -117,9 +117,10 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         """The stand-in for a function; ValueError for all others."""
         name = f"{module_name.replace('numpy._core', 'numpy.core')[:40]}.{global_name[:40]}"
-        if name not in _STAND_INS:
+        stand_in = _stand_ins().get(name)
+        if stand_in is None:
             raise ValueError(name)
-        return _StandIn(_STAND_INS[name])
+        return _StandIn(stand_in)
 
 
 class _StandIn:
@@ -162,14 +163,16 @@ def _make_array(data: Any, dtype: Any, shape: Any, order: str) -> Any:
     return np.frombuffer(data, kind).reshape(shape, order="F" if order == "F" else "C")
 
 
-_STAND_INS: dict[str, Callable[..., Any]] = {
-    "numpy.ndarray": Stored,
-    "numpy.dtype": _dtype,
-    "numpy.core.multiarray._reconstruct": lambda *_: Stored(),
-    "numpy.core.multiarray.scalar": lambda dtype, data: _make_array(data, dtype, (), "C").item(),
-    "numpy.core.numeric._frombuffer": lambda *given: Stored(value=_make_array(*given)),
-    "_codecs.encode": lambda text, *_: _text(text).encode("latin-1"),
-    "collections.OrderedDict": dict,
-    "builtins.bytes": lambda: b"",
-    "__builtin__.bytes": lambda: b"",
-}
+def _stand_ins() -> dict[str, Callable[..., Any]]:
+    """What runs instead of the functions that a pickle may name."""
+    return {
+        "numpy.ndarray": Stored,
+        "numpy.dtype": _dtype,
+        "numpy.core.multiarray._reconstruct": lambda *_: Stored(),
+        "numpy.core.multiarray.scalar": lambda dtype, data: _make_array(data, dtype, (), "C").item(),
+        "numpy.core.numeric._frombuffer": lambda *given: Stored(value=_make_array(*given)),
+        "_codecs.encode": lambda text, *_: _text(text).encode("latin-1"),
+        "collections.OrderedDict": dict,
+        "builtins.bytes": lambda: b"",
+        "__builtin__.bytes": lambda: b"",
+    }

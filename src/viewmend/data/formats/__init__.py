@@ -5,8 +5,8 @@ format, or None. `content(folder, file)` returns the equivalent content of a `ca
 raises a ValueError for invalid input.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from viewmend.data.formats import (
     zju_mocap,
 )
 from viewmend.data.formats.files import folders_containing
+from viewmend.data.formats.reader import Format
 from viewmend.data.native_format import (
     CALIBRATION,
     NativeCalibration,
@@ -39,30 +40,19 @@ from viewmend.data.native_format import (
     read_calibration,
 )
 
-_DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
-_TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
+DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
+"""Formats of published data sets."""
+TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
+"""Formats of other programs."""
 SESSIONS = ("pose2sim", "qualisys")
 """Formats whose calibration may lie in a folder next to that of the recording, or one level higher."""
-
-
-@dataclass(frozen=True)
-class Format:
-    """The functions of a format's module."""
-
-    find: Callable[[Path], Path | None]
-    content: Callable[[Path, Path], dict[str, Any]]
-    root: Callable[[Path, Path], Path] = lambda path, _: path
-    """The folder that the paths in the content are relative to."""
-
-
 FORMATS = {
-    module.__name__.rpartition(".")[2]: Format(
-        module.find, module.content, getattr(module, "root", Format.root)
-    )
-    for module in (transforms, colmap, *_DATA_SETS, *_TOOLS)
+    module.__name__.rpartition(".")[2]: Format.of_module(module)
+    for module in (transforms, colmap, *DATA_SETS, *TOOLS)
 }
 """All formats but our own, in the order in which they are tried."""
 FORMAT_NAMES = ("plain", *FORMATS)
+"""The names of all formats; ours is `plain`."""
 
 
 def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:

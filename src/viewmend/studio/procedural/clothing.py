@@ -1,9 +1,7 @@
 """Makes garments from the body's own shape, and paints them with cloth."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -17,14 +15,12 @@ from viewmend.studio.procedural.body import (
     smoothstep,
 )
 from viewmend.studio.procedural.fabric import (
-    PX_PER_M,
     QUIET,
     WORDS,
     Canvas,
     Fabric,
     Image,
     Patch,
-    Plane,
     blend,
     edge,
     hsv,
@@ -33,9 +29,9 @@ from viewmend.studio.procedural.fabric import (
     two_sided,
     write,
 )
+from viewmend.studio.procedural.folds import Folds, Painter
 from viewmend.studio.procedural.skeleton import INDEX, SIDES, SKIRT_COLUMNS, Physique, Points, Values, Weights
 
-Painter = Callable[[Canvas], Image]
 Azimuths = Float[np.ndarray, "column"]
 TOPS = ("t-shirt", "long sleeves", "shirt", "sweater", "tank top")
 """Kinds of tops."""
@@ -47,47 +43,7 @@ LOOSE = ("plain", "heather", "denim", "tartan", "gingham", "knit", "pinstripes")
 """Patterns of fabrics of jackets and coats."""
 LOWER = ("plain", "heather", "pinstripes", "tartan", "blobs", "knit", "zigzag", "gingham")
 """Patterns of clothes below the waist."""
-
-
-@dataclass(frozen=True)
-class Folds:
-    """Soft creases: displaced geometry, and shading that is painted onto the cloth."""
-
-    depth_m: float
-    along_m: float
-    """Grain along the axis."""
-    around_m: float
-    seed: int
-    px_per_m: float = PX_PER_M
-    """Texels of the sheet's chart."""
-
-    def height(self, canvas: Canvas) -> Plane:
-        """Displacement on the canvas, metres, periodic from the right edge to the left one."""
-        rng = np.random.default_rng(self.seed)
-        field = canvas.noise(rng, self.around_m, self.along_m)
-        field = field + 0.4 * canvas.noise(rng, self.around_m / 2, self.along_m / 2)
-        share = np.clip((np.linspace(0, 1, field.shape[1]) - 0.85) / 0.15, 0, 1)
-        return self.depth_m * (field + share * (field[:, :1] - field))
-
-    def crease(
-        self, canvas: Canvas, uv: Float[np.ndarray, "row column 2"]
-    ) -> Float[np.ndarray, "row column"]:
-        """Compute the displacement at positions on the canvas, metres."""
-        height = self.height(canvas).astype(np.float32)
-        rows, columns = height.shape
-        x = uv[..., 0] * (columns - 1)
-        y = (1 - uv[..., 1]) * (rows - 1)
-        return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(
-            np.float64
-        )
-
-    def paint(self, canvas: Canvas, painter: Painter) -> Image:
-        """Paint cloth with creases: slopes that face down are darker."""
-        slope = np.gradient(self.height(canvas), axis=0) * canvas.px_per_m
-        return np.clip(painter(canvas) * np.clip(1 + 0.8 * slope, 0.65, 1.2)[..., None], 0, 1)
-
-
-BARE = Folds(0.0, 0.1, 0.1, 0, 220.0)
+BARE = Folds(depth_m=0.0, along_m=0.1, around_m=0.1, seed=0, px_per_m=220.0)
 """Skin, which is smooth and has little texture."""
 
 

@@ -279,14 +279,21 @@ def _goal(score: Score, step: int) -> Float[np.ndarray, "side 3"]:
     return np.stack([left, right]) + rng.uniform(-0.03, 0.03, (2, 3))
 
 
-STANCES = {
-    **dict.fromkeys(("walk", "run", "march", "turn", "spin", "sidestep"), _step),
-    **dict.fromkeys(("talk", "sway", "groove", "box", "lunge"), _stand),
-    "jacks": _jump,
-    "crouch": _crouch,
-    "sit": _sit,
-    "reach": _reach,
-}
+def score_stance(score: Score, time_s: float, beats: float) -> Stance:
+    """The stance of a score's motion at this time; `beats` counts the beats since time 0."""
+    match score.kind:
+        case "walk" | "run" | "march" | "turn" | "spin" | "sidestep":
+            return _step(score, time_s, beats)
+        case "jacks":
+            return _jump(score, time_s, beats)
+        case "crouch":
+            return _crouch(score, time_s, beats)
+        case "sit":
+            return _sit(score, time_s, beats)
+        case "reach":
+            return _reach(score, time_s, beats)
+        case _:  # talk, sway, groove, box and lunge
+            return _stand(score, time_s, beats)
 
 
 @dataclass(frozen=True)
@@ -349,7 +356,7 @@ class Motion:
     def stance(self, time_s: float) -> Stance:
         """Compute the body's stance at this time."""
         beats = self.score.beat_hz * time_s + float(self.score.amounts[7])
-        stance = STANCES[self.score.kind](self.score, time_s, beats)
+        stance = score_stance(self.score, time_s, beats)
         a, b, c = 6 * self.score.amounts[:3]
         look = 0.45 * np.sin(0.9 * time_s + a) * np.sin(0.37 * time_s + b)
         strong = 0.03 if self.score.tempo == "calm" else 0.10
