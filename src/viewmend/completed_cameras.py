@@ -18,8 +18,8 @@ from viewmend.types import MultiViewFrame
 MAX_COMPLETED = 24
 """The largest number of completed virtual cameras of a frame."""
 FINER = 1.4
-"""The sides of completed images are this many times as long as those of the cameras' images, because
-drawing from an image blurs it once more."""
+"""Completed images have this many times as many pixels along a side as the cameras' images, because
+the page blurs them once more when it draws from them."""
 MAX_FINER_PX = 1024
 """Images are not enlarged beyond this length of their longer side, in pixels."""
 

@@ -12,7 +12,7 @@ CEILINGS = {
     "prepositions": 3,
     "late_constants": 5,
     "statements": 2,
-    "locals": 20,
+    "locals": 10,
 }
 """The most of each pattern in the package."""
 MAX_LONG_LINES_PERCENT = 1.5

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from geometry.solids import around, ball_masks, camera_at, dome
 from reference.hull_twin import hull_twin
 
 from viewmend.geometry import hull as hull_module
+from viewmend.geometry._hull_numba import NEAR_M, locate
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.hull import (
@@ -162,3 +164,24 @@ def test_cuda_equals_cpu():
     here = visual_hull(masks, cameras, around(0.7), SMALL)
     there = visual_hull(masks.cuda(), cameras.to("cuda"), around(0.7).to("cuda"), SMALL)
     assert ((here.values - there.values.cpu()).abs() > 0.01).float().mean() < 1e-3
+
+
+def test_an_image_has_the_points_on_its_first_borders_and_none_on_its_last():
+    """A camera with P = [1 | 0] sees (u, v, 1) at (u, v)."""
+    points = [
+        ((0.0, 0.0, 1.0), True),
+        ((3.99, 2.99, 1.0), True),
+        ((4.0, 1.0, 1.0), False),
+        ((1.0, 3.0, 1.0), False),
+        ((-0.01, 1.0, 1.0), False),
+        ((1.0, -0.01, 1.0), False),
+        ((0.0, 0.0, NEAR_M), False),
+        ((0.0, 0.0, 2 * NEAR_M), True),
+        ((1.0, 1.0, -1.0), False),
+    ]
+    scratch = np.zeros((8, len(points)), np.float32)
+    scratch[:3] = np.array([point for point, _ in points]).T
+    locate(np.eye(3, 4), (0.0, 0.0, 0.0), 1.0, np.array([4, 3]), 1, len(points), scratch)
+    u, v = scratch[6:]
+    assert (u >= 0).tolist() == [seen for _, seen in points]
+    assert u[1] == pytest.approx(3.99) and v[1] == pytest.approx(2.99)

@@ -1,11 +1,13 @@
 """Drawing meshes: the slow twin, both fast paths, and the cases where rasterisers go wrong."""
 
+import numpy as np
 import pytest
 import torch
 from geometry.solids import ball_mesh, camera_at, dome
 from reference.ball import proxy, ring
 from reference.raster_twin import raster_twin
 
+from viewmend.geometry._rasterize_numba import pixel_box
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers, unproject
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import Raster, interpolate, rasterize, rasterize_torch
@@ -139,3 +141,37 @@ def test_gradients_reach_the_attributes():
     interpolate(attributes, ball.mesh, cameras, raster).sum().backward()
     assert attributes.grad is not None
     torch.testing.assert_close(attributes.grad.sum(), (raster.triangle >= 0).sum().float())
+
+
+# The box of pixels in which a face is drawn; pixels that are in the box in vain only cost time.
+
+
+def corner(u_px: float, v_px: float, z: float = 1.0) -> np.ndarray:
+    """A row that `project_vertices` writes."""
+    return np.array([u_px * z, v_px * z, z, u_px, v_px])
+
+
+@pytest.mark.parametrize(
+    ("columns_px", "columns"),
+    [
+        ((2.5, 5.5), (2, 6)),  # centres on the face's border belong to it
+        ((2.51, 5.49), (3, 5)),
+        ((-3.0, 0.2), (0, 0)),  # it ends before the first centre
+        ((9.6, 14.0), (10, 10)),  # it begins after the last one
+        ((-1e9, 1e9), (0, 10)),
+    ],
+)
+def test_a_face_is_drawn_only_where_it_may_have_pixels(columns_px, columns):
+    low, high = columns_px
+    across = [corner(low, 1.5), corner(high, 1.5), corner(low, 4.5)]
+    down = [corner(1.5, low), corner(1.5, high), corner(4.5, low)]
+    assert pixel_box(*across, 1e-6, (0, 10), (0, 8)) == (*columns, 1, 5)
+    assert pixel_box(*down, 1e-6, (0, 8), (0, 10)) == (1, 5, *columns)
+
+
+def test_a_face_that_reaches_behind_the_camera_may_have_all_pixels():
+    behind = corner(2.5, 2.5, -1.0)
+    at_near = corner(2.5, 2.5, 1e-6)
+    assert pixel_box(corner(1.0, 1.0), corner(3.0, 1.0), behind, 1e-6, (0, 10), (2, 8)) == (0, 10, 2, 8)
+    assert pixel_box(corner(1.0, 1.0), corner(3.0, 1.0), at_near, 1e-6, (0, 10), (2, 8)) == (0, 10, 2, 8)
+    assert pixel_box(behind, behind, at_near, 1e-6, (0, 10), (2, 8)) == (0, 0, 0, 0)

@@ -91,7 +91,7 @@ MAX_ENCODER_DELAY = 2.5
 WITHOUT_TIMES = {"h264", "hevc", "mjpeg", "mpegvideo", "obu", "m4v", "dirac", "vc1"}
 """Raw streams, whose frames have no times and whose rate is often assumed."""
 HIDDEN_FRAMES = ("vp8",)
-"""Codecs of which some packets show no frame, so that packets cannot be counted instead of frames."""
+"""Codecs with packets that show no frame: the number of packets is not the number of frames."""
 CHECKED_FRAMES = 8
 """The times of this many frames at the start are compared with those of their packets."""
 SEEK_FRAMES = 8
@@ -393,8 +393,8 @@ class VideoFile:
     def __init__(self, path: Path):
         self.path = path
         self._decoding: dict[int, _Decoding] = {}
-        """By process: a forked one has neither the decoder's threads nor the thread that may have locked it.
-        It keeps the decoder of its parent, as closing it would wait for these threads."""
+        """A decoder for each process. A forked process has no decoder threads and cannot unlock its
+        parent's decoder, so it opens its own. It does not close the parent's, which would wait for threads."""
 
     def read(self, index: int, where: str) -> Image | None:
         """The frame at `index` as RGB, read-only; None if damaged, a CaptureError that `where` starts if absent."""

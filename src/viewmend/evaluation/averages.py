@@ -152,7 +152,7 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 
 def vfid(cells: Sequence[Cell]) -> dict[str, float | None]:
-    """Distance between all videos of these cells and those of the truth."""
+    """The distance between the videos of these cells and the true videos."""
     pairs = [
         (c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None
     ]

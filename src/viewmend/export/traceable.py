@@ -74,7 +74,7 @@ class ViewInputs(NamedTuple):
     is_source: Bool[Tensor, "chosen"]
     """Whether each of them coloured the view."""
     images: UInt8[Tensor, "camera 3 rows columns"]
-    """RGB of all cameras; of those that are not chosen, anything."""
+    """RGB of all cameras; cameras that are not chosen may have any values."""
     masks: UInt8[Tensor, "camera rows columns"]
     """Foreground masks of all cameras, 0 to 255."""
     proxy_depths: Float[Tensor, "camera rows columns"]
@@ -298,8 +298,7 @@ def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     tops = torch.cat([torch.full((1,), size, dtype=torch.long) for size in heights]).cumsum(0)
     columns = sheet.shape[3]
     areas = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
-    first_finest = torch.zeros(1, dtype=torch.long)
-    first = torch.cat([first_finest, tops * columns + width, areas + sheet.shape[2] * columns])
+    first = torch.cat([torch.zeros_like(tops[:1]), tops * columns + width, areas + sheet.shape[2] * columns])
     sheet_columns = torch.full((CONSTANT,), columns, dtype=torch.long)
     row_columns = torch.tensor([row.shape[3] for row in rows])
     sides = [torch.cat([torch.full((1,), level.shape[axis] + 1) for level in levels]) for axis in (2, 3)]

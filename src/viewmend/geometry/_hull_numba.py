@@ -186,7 +186,7 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
 
 @kernel
 def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values, scratch):
-    """Voxel by voxel: the smallest bilinear mask value over those of `views` that see it; 0 where too few do.
+    """Fill `values` with the smallest bilinear mask value of the `views` that see a voxel; 0 where too few do.
 
     One camera after another is asked about the voxels that are left, gathered at the front of `scratch`.
     """
@@ -231,27 +231,9 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
 @kernel(fastmath=True)
 def locate(P, origin, voxel_m, size, pool, count, scratch):
     """Where the first `count` voxels are in one camera's pooled mask: scratch[6:8]; -1 in scratch[6] if out of view."""
-    base = np.empty(3, np.float32)
-    step = np.empty((3, 3), np.float32)
-    for row in range(3):
-        scale = 1.0 if row == 2 else 1.0 / pool
-        base[row] = scale * (
-            P[row, 0] * origin[0] + P[row, 1] * origin[1] + P[row, 2] * origin[2] + P[row, 3]
-        )
-        for axis in range(3):
-            step[row, axis] = scale * voxel_m * P[row, axis]
-    u0 = base[0]
-    v0 = base[1]
-    w0 = base[2]
-    ux = step[0, 0]
-    uy = step[0, 1]
-    uz = step[0, 2]
-    vx = step[1, 0]
-    vy = step[1, 1]
-    vz = step[1, 2]
-    wx = step[2, 0]
-    wy = step[2, 1]
-    wz = step[2, 2]
+    u_row = voxel_row(P[0], origin, voxel_m, 1.0 / pool)
+    v_row = voxel_row(P[1], origin, voxel_m, 1.0 / pool)
+    z_row = voxel_row(P[2], origin, voxel_m, 1.0)
     width = np.float32(size[0] / pool)
     height = np.float32(size[1] / pool)
     one = np.float32(1)
@@ -263,13 +245,26 @@ def locate(P, origin, voxel_m, size, pool, count, scratch):
     us = scratch[6]
     vs = scratch[7]
     for n in range(count):
-        depth = w0 + x[n] * wx + y[n] * wy + z[n] * wz
+        depth = z_row[0] + x[n] * z_row[1] + y[n] * z_row[2] + z[n] * z_row[3]
         inverse = one / max(depth, near)
-        u = (u0 + x[n] * ux + y[n] * uy + z[n] * uz) * inverse
-        v = (v0 + x[n] * vx + y[n] * vy + z[n] * vz) * inverse
+        u = (u_row[0] + x[n] * u_row[1] + y[n] * u_row[2] + z[n] * u_row[3]) * inverse
+        v = (v_row[0] + x[n] * v_row[1] + y[n] * v_row[2] + z[n] * v_row[3]) * inverse
         sees = (depth > near) & (u >= nothing) & (u < width) & (v >= nothing) & (v < height)
         us[n] = u if sees else -one
         vs[n] = v
+
+
+@kernel(inline="always")
+def voxel_row(row, origin, voxel_m, scale):
+    """A row of P times `scale`, as a function of voxel indices: its value at `origin`, its steps along x, y, z."""
+    first = row[0] * origin[0] + row[1] * origin[1] + row[2] * origin[2] + row[3]
+    step = scale * voxel_m
+    return (
+        np.float32(scale * first),
+        np.float32(step * row[0]),
+        np.float32(step * row[1]),
+        np.float32(step * row[2]),
+    )
 
 
 @kernel(fastmath=True)
@@ -295,16 +290,7 @@ def sample(image, count, scratch):
             seen[n] += one
             u = min(max(us[n] - half, nothing), last_x)
             v = min(max(vs[n] - half, nothing), last_y)
-            # Unsigned, so that numba does not look for negative indices.
-            left = np.uint32(np.int32(u))
-            top = np.uint32(np.int32(v))
-            right = np.uint32(left + 1)
-            bottom = np.uint32(top + 1)
-            a = u - np.float32(left)
-            b = v - np.float32(top)
-            over = np.float32(image[top, left]) * (one - a) + np.float32(image[top, right]) * a
-            under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
-            value = min(value, over * (one - b) + under * b)
+            value = min(value, bilinear(image, u, v))
         if value > 0:
             x[kept] = x[n]
             y[kept] = y[n]
@@ -314,3 +300,19 @@ def sample(image, count, scratch):
             place[kept] = place[n]
             kept += 1
     return kept
+
+
+@kernel(inline="always")
+def bilinear(image, u, v):
+    """The image at (u, v) >= 0; (0, 0) is the centre of its first pixel. (u + 1, v + 1) must be in it, too."""
+    one = np.float32(1)
+    # Unsigned, so that numba does not look for negative indices.
+    left = np.uint32(np.int32(u))
+    top = np.uint32(np.int32(v))
+    right = np.uint32(left + 1)
+    bottom = np.uint32(top + 1)
+    a = u - np.float32(left)
+    b = v - np.float32(top)
+    over = np.float32(image[top, left]) * (one - a) + np.float32(image[top, right]) * a
+    under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
+    return over * (one - b) + under * b

@@ -122,7 +122,7 @@ class Cubes:
 
     @classmethod
     def of(cls, bounds: Bounds, resolution: int) -> "Cubes":
-        """Cubes of which the box's longest side has `resolution`."""
+        """Fill a box with cubes, `resolution` of them along its longest side."""
         sides = bounds.on_host.size_m.tolist()
         side_m = max(sides) / resolution
         x, y, z = (max(1, math.ceil(side / side_m - 1e-3)) for side in sides)
@@ -216,7 +216,7 @@ def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_bloc
 
 
 def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:
-    """How many of `views` cameras must see a point for it to count, `cut_off` of which see a part of the subject."""
+    """How many of `views` cameras must see a point for it to count; `cut_off` of them see the subject in part."""
     usual = math.ceil(config.min_fraction * views)
     whole = views - cut_off
     if whole >= 2:
@@ -226,7 +226,7 @@ def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:
 
 
 def count_cut_off(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> int:
-    """How many images have a border that cuts the subject of their mask off; reads a device once."""
+    """The number of images in which the subject is cut off at the border; reads a device once."""
     return int(are_cut_off(mask, cameras).sum())
 
 

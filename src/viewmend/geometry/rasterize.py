@@ -147,8 +147,8 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     low, high = _pixel_boxes(corners, cameras.size_px)
     keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
 
-    # every triangle of every view has a box of pixels, of which the device tells only the total
-    # number at first
+    # Every triangle of every view has a box of pixels. Only the total number of pixels is read from
+    # the device.
     view = torch.arange(len(cameras), device=device).repeat_interleave(
         len(mesh.faces), output_size=keep.numel()
     )

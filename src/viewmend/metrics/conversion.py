@@ -171,7 +171,7 @@ def _check_hash(path: Path, sha256: str, what: str) -> None:
 
 
 def _units(tree: Any) -> dict[str, Any]:
-    """The units by path: those of a block are one level below the others."""
+    """The units by path; units of a block are one level deeper than the others."""
     single = {name: part for name, part in tree.items() if not name.startswith("Mixed_")}
     return single | {
         f"{block}/{name}": part for block in tree.keys() - single for name, part in tree[block].items()

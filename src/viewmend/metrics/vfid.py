@@ -21,7 +21,7 @@ from viewmend.utils.weight_files import load_weights
 
 Mode = Literal["eval", "train"]
 MODES: tuple[Mode, ...] = ("eval", "train")
-"""Normalisation with the statistics of I3D's training, or with those of each video."""
+"""Normalisation with the statistics of I3D's training, or with the statistics of each video."""
 Triple = tuple[int, ...]
 MIXED: dict[str, tuple[int, Sequence[int]]] = {
     "Mixed_3b": (192, (64, 96, 128, 16, 32, 32)),

@@ -113,7 +113,7 @@ class ContextProvider:
         self._memory = memory or self._own_memory
 
     def __call__(self, time: int, names: Sequence[str]) -> ContextViews | None:
-        """These cameras in this frame, without those that are excluded or have no image; None if none is left."""
+        """The named cameras that have an image in this frame and are not excluded; None if there is none."""
         names = tuple(name for name in names if name not in self._exclude)
         return self._views(time, names) if names else None
 

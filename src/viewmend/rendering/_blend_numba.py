@@ -68,13 +68,26 @@ def _weigh(
         return 0.0
     u = (P[view, 0, 0] * x + P[view, 0, 1] * y + P[view, 0, 2] * w + P[view, 0, 3]) / z
     v = (P[view, 1, 0] * x + P[view, 1, 1] * y + P[view, 1, 2] * w + P[view, 1, 3]) / z
-    width = sizes[view, 0]
-    height = sizes[view, 1]
-    if not (0 <= u < width and 0 <= v < height):
+    if not (0 <= u < sizes[view, 0] and 0 <= v < sizes[view, 1]):
         return 0.0
 
     per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, tolerance[2])
     nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
+    usable = _sample(view, u, v, nearest, images, masks, depths, sizes, colour)
+    if usable <= 0:
+        return 0.0
+    return usable * facing ** powers[0] * agreeing ** powers[1]
+
+
+@kernel(inline="always")
+def _sample(view, u, v, nearest, images, masks, depths, sizes, colour):
+    """Sample one camera's image bilinearly into `colour[view]`, and return which part of the sample is usable.
+
+    Pixels are not usable outside of the mask, or where the proxy is nearer than `nearest`. The
+    colour is the mean of the usable pixels.
+    """
+    width = sizes[view, 0]
+    height = sizes[view, 1]
     left = floor(u - 0.5)
     top = floor(v - 0.5)
     right_share = u - 0.5 - left
@@ -104,7 +117,7 @@ def _weigh(
     colour[view, 0] = red * scale
     colour[view, 1] = green * scale
     colour[view, 2] = blue * scale
-    return usable * facing ** powers[0] * agreeing ** powers[1]
+    return usable
 
 
 @kernel

@@ -176,7 +176,7 @@ def _sample(
     per_pixel = z / focal * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
     farthest = bias_m + config.slope_px * per_pixel
 
-    # the four pixels around each sample, of which those count that are foreground and visible
+    # of the four pixels around each sample, only visible foreground counts
     taps = bilinear_taps(uv, rig)
     view = torch.arange(len(rig), device=z.device)[:, None]
     depth = sources.depth[view, taps.row, taps.column]

@@ -128,7 +128,7 @@ class StudioScene(LeaveOneOutScene):
     def _draw(
         self, studio: Studio, time: int, closest: tuple[str, ...], scored: bool
     ) -> tuple[MultiViewFrame, Silhouettes | None]:
-        """The images of the input cameras at a frame, and the masks of those that are not coloured."""
+        """The images of the input cameras that colour the view, and the masks of the other input cameras."""
         count = self.coloured if scored or self.coloured is None else min(self.coloured, COLOURED_BEFORE)
         drawn = set(closest[:count])
         names = [name for name in studio.cameras.names if name in drawn]
@@ -165,7 +165,7 @@ def procedural_set(
 
 
 def _scene(name: str, set: str, cameras: int, style: str, config: StudioConfig, **more: Any) -> StudioScene:
-    """A scene seen by a ring of cameras, of which the seed leaves out one: any, but not in step with the seed."""
+    """A scene seen by a ring of cameras. Its seed determines which one is left out."""
     held = _held_out_camera(config.seed, cameras)
     return StudioScene(
         name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more

@@ -77,37 +77,54 @@ def interpolate(scene, projected, face, u, v, at):
     i = scene.faces[face, 0]
     j = scene.faces[face, 1]
     k = scene.faces[face, 2]
-    ax = projected[i, 0]
-    ay = projected[i, 1]
-    az = projected[i, 2]
-    bx = projected[j, 0]
-    by = projected[j, 1]
-    bz = projected[j, 2]
-    cx = projected[k, 0]
-    cy = projected[k, 1]
-    cz = projected[k, 2]
-    a = (by * cz - bz * cy) * u + (bz * cx - bx * cz) * v + (bx * cy - by * cx)
-    b = (cy * az - cz * ay) * u + (cz * ax - cx * az) * v + (cx * ay - cy * ax)
-    c = (ay * bz - az * by) * u + (az * bx - ax * bz) * v + (ax * by - ay * bx)
-    total = a + b + c
-    wa = np.float32(a / total)
-    wb = np.float32(b / total)
-    wc = np.float32(c / total)
+    a = corner(projected, i)
+    b = corner(projected, j)
+    c = corner(projected, k)
+    at_a = edge_value(b, c, u, v)
+    at_b = edge_value(c, a, u, v)
+    at_c = edge_value(a, b, u, v)
+    total = at_a + at_b + at_c
+    wa = np.float32(at_a / total)
+    wb = np.float32(at_b / total)
+    wc = np.float32(at_c / total)
     vertex = scene.vertex
     for n in range(11):
         at[n] = wa * vertex[i, n] + wb * vertex[j, n] + wc * vertex[k, n]
-    if az <= 0 or bz <= 0 or cz <= 0:
+    if a[2] <= 0 or b[2] <= 0 or c[2] <= 0:
         return 0.0
+    return texture_level(scene, face, a, b, c)
+
+
+@kernel(inline="always")
+def corner(projected, n):
+    """A vertex in pixels times z."""
+    return projected[n, 0], projected[n, 1], projected[n, 2]
+
+
+@kernel(inline="always")
+def edge_value(p, q, u, v):
+    """The value of the edge between two projected corners at a pixel: (p x q) . (u, v, 1)."""
+    across = p[1] * q[2] - p[2] * q[1]
+    down = p[2] * q[0] - p[0] * q[2]
+    return across * u + down * v + (p[0] * q[1] - p[1] * q[0])
+
+
+@kernel(inline="always")
+def texture_level(scene, face, a, b, c):
+    """The pyramid level of a face's texture at which a texel is as large as a pixel; a, b, c: projected corners."""
+    i = scene.faces[face, 0]
+    j = scene.faces[face, 1]
+    k = scene.faces[face, 2]
+    vertex = scene.vertex
     texture = scene.textures[face]
     u1 = vertex[j, 3] - vertex[i, 3]
     v1 = vertex[j, 4] - vertex[i, 4]
     u2 = vertex[k, 3] - vertex[i, 3]
     v2 = vertex[k, 4] - vertex[i, 4]
     texels = np.abs(u1 * v2 - v1 * u2) * scene.size[texture, 0, 0] * scene.size[texture, 0, 1]
-    x0 = ax / az
-    y0 = ay / az
-    pixels = np.abs((bx / bz - x0) * (cy / cz - y0) - (by / bz - y0) * (cx / cz - x0))
-    # At this level a texel is as large as a pixel.
+    x0 = a[0] / a[2]
+    y0 = a[1] / a[2]
+    pixels = np.abs((b[0] / b[2] - x0) * (c[1] / c[2] - y0) - (b[1] / b[2] - y0) * (c[0] / c[2] - x0))
     level = 0.5 * np.log2(max(texels / max(pixels, 2e-6), 1e-6))
     return min(max(level, 0.0), scene.first.shape[1] - 1.0)
 

@@ -53,13 +53,13 @@ class HeldBack:
     """The camera and the frames of a capture that training never uses."""
 
     camera: str | None
-    """None for rigs of fewer than `MIN_CAMERAS`, and for those of a splits file."""
+    """None if the rig has fewer than `MIN_CAMERAS`, or is listed in a splits file."""
     first_frame: int
-    """Frames from this one on; the number of frames if the capture has only one."""
+    """The first frame that training never uses; 1 if the capture has a single frame, which it does use."""
 
     @classmethod
     def of(cls, capture: CaptureSource, camera: str | None) -> "HeldBack":
-        """This camera, or with `AUTO` the middle one of those that see the subject, and the last frames.
+        """Hold back this camera and the last frames; `AUTO` chooses the middle one of the cameras that see the subject.
 
         Raises:
             CaptureError: there is no such camera, or too few others.
@@ -197,11 +197,11 @@ def _subject_box(mask: Tensor) -> tuple[slice, slice]:
 
 
 def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator[HeldBackView]:
-    """The views on which a run is validated, or with `table` those of its final table, the held-back camera first.
+    """The views on which a run is validated; with `table`, the views of its final table. The held-back camera is first.
 
     A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back
-    camera, all cameras are rendered at frames that are held back. Of a splits file, the first
-    `MAX_VIEWS` captures are used, for the table the first. Raises as `open_training_captures`.
+    camera, all cameras are rendered at frames that are held back. If `place` is a splits file, its first
+    `MAX_VIEWS` captures are used, or for the table only its first. Raises as `open_training_captures`.
     """
     for opened in open_training_captures(place, hold_out)[: 1 if table else MAX_VIEWS]:
         assert opened.held_back is not None, "something is held back"
@@ -295,7 +295,7 @@ class KeptWeights:
     """The weights that a run kept, by its validations."""
 
     step: int
-    """The step after which they were reached; 0 for those that the run started from."""
+    """The step that gave these weights; 0 if they are the starting weights."""
     steps: int
     """The last step that was validated."""
     first: dict[str, float | None]
@@ -339,7 +339,7 @@ class KeptWeights:
 
 
 def compare(place: Path, hold_out: str, models: Mapping[str, Inpainter], sheet: Path) -> str:
-    """A Markdown table of the scores of models by camera, next to those of the rendered views.
+    """A Markdown table of scores by camera, of the rendered views and of the models.
 
     Args:
         place: a capture, or a splits file, of which the first capture is used.

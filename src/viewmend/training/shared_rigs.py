@@ -48,10 +48,11 @@ class WrongMasks:
 
 
 class SharedRigScenes:
-    """Samples of studio rigs, each of which is drawn once for all of its held-out cameras.
+    """Samples of studio rigs. A rig is drawn once for all of its held-out cameras.
 
-    Of each frame all masks are drawn, but only the images that a sample shows. With the protocol
-    "hull-with-target-mask", which is drawn for a whole rig, the masks of all held-out cameras carve the hull.
+    Each frame has the masks of all cameras, but only the images that a sample needs. A protocol is
+    chosen for a whole rig: with "hull-with-target-mask", the hull is computed from the masks of all held-out
+    cameras, too.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class SharedRigScenes:
         self.split: Split = split
 
     def scene(self, number: int) -> list[Sample]:
-        """The samples of rig `number`: those of its held-out cameras whose views have enough holes."""
+        """The samples of rig `number`: one for each held-out camera whose view has enough holes."""
         random = Random(f"{self.seed}/{number}")
         config = self.config
         if config.few_cameras_fraction and random.random() < config.few_cameras_fraction:

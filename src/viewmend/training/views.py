@@ -350,11 +350,19 @@ class ViewsObjective(Objective[ViewSynthNet]):
         cells = tuple(distribution.cells.T)
         shares = distribution.logits.softmax(1)[..., None]
         truth = F.avg_pool2d(crop.truth[None] / 255, CELL_PX, ceil_mode=True)[0, :, cells[0], cells[1]].T
-        total = weights.cell_colour * ((shares * distribution.samples.colour).sum(1) - truth).abs().mean()
-        if crop.depth is None:
-            return total
+        colour = ((shares * distribution.samples.colour).sum(1) - truth).abs().mean()
+        total = weights.cell_colour * colour
+        return total if crop.depth is None else total + self._depth_terms(crop, made, crop.depth)
+
+    def _depth_terms(
+        self, crop: TrainingView, made: ViewPrediction, true_depth: Float[Tensor, "height width"]
+    ) -> Float[Tensor, ""]:
+        """The terms of cells where the true depth is known: the depth itself, and which cameras see the surface."""
+        distribution = made.distribution
+        weights = self.weights
+        cells = tuple(distribution.cells.T)
         alpha = F.avg_pool2d(crop.alpha[None] / 255, CELL_PX, ceil_mode=True)[0][cells]
-        z = nearest_depth(crop.depth)[cells]
+        z = nearest_depth(true_depth)[cells]
         offsets = z.new_tensor(OFFSETS)
         offset = (z - distribution.depth[cells]) / crop.scale.size_m
         known = (z > 0) & (alpha > 0.5) & (offset > offsets[0] - VISIBLE) & (offset < offsets[-1] + 0.1)
@@ -369,7 +377,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
             seen = seen.gather(1, distribution.cameras)
         trust = distribution.samples.trust[torch.arange(len(nearest)), nearest]
         visibility = -_masked_mean(((trust * seen).sum(1) + 1e-3).log(), known & seen.any(1))
-        return total + weights.depth * depth + weights.visibility * visibility
+        return weights.depth * depth + weights.visibility * visibility
 
 
 @dataclass(frozen=True, kw_only=True)

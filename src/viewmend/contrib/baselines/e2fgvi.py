@@ -51,7 +51,7 @@ class FocalAttention(nn.Module):
         tokens: Float[Tensor, "sample frame row column dim"],
         pooled: Float[Tensor, "sample frame window_row window_column dim"],
     ) -> Float[Tensor, "sample frame row column dim"]:
-        """The frames' tokens after attention to those of all frames; `pooled` has one token of each window."""
+        """The frames' tokens after attention to the tokens of all frames; `pooled` has one token of each window."""
         dim = tokens.shape[-1]
         grid = (pooled.shape[2], pooled.shape[3])
         device = tokens.device

@@ -66,7 +66,7 @@ class MultiHeadAttention(nn.Module):
         self.output_linear = nn.Linear(DIM, DIM)
 
     def forward(self, tokens: Float[Tensor, "group token 512"]) -> Float[Tensor, "group token 512"]:
-        """Each token's mixture of those of its group."""
+        """The tokens after attention within their group."""
         projected = self.query_embedding(tokens), self.key_embedding(tokens), self.value_embedding(tokens)
         Q, K, V = (rearrange(x, "g n (h c) -> g h n c", h=HEADS) for x in projected)
         return self.output_linear(rearrange(scaled_dot_product_attention(Q, K, V), "g h n c -> g n (h c)"))

@@ -60,7 +60,7 @@ TURNED: dict[str, Callable[[Tensor], Tensor]] = {
     "upside down": lambda mask: mask.flip(0),
     "rotated by 180 degrees": lambda mask: mask.flip(0, 1),
 }
-"""Masks may be turned in these ways, each of which the function undoes."""
+"""The ways in which masks may be turned, with functions that turn them back."""
 TURNED_SQUARES: dict[str, Callable[[Tensor], Tensor]] = {
     "rotated by 90 degrees clockwise": lambda mask: mask.rot90(1),
     "rotated by 90 degrees counter-clockwise": lambda mask: mask.rot90(-1),

@@ -29,7 +29,7 @@ MIN_CAMERAS = 4
 MAX_PEERS = 10
 """The effect of a camera on the hull is measured in at most this many other cameras."""
 FEW_CAMERAS = 5
-"""Rigs of at most this many cameras can least do without one."""
+"""Smaller rigs than this, and rigs of this many cameras, suffer most from a missing camera."""
 OUTLINE_LONGEST_PX = 384
 """Outlines are compared in images of at most this many pixels along their longer side."""
 OUTLINE_POINTS = 40
@@ -42,8 +42,8 @@ MIN_OUTLINE_CAMERAS = 5
 """Outlines are compared in rigs of at least this many cameras: the rest of smaller rigs always
 agrees too well."""
 WORST_POINTS = 0.01
-"""This share of the points, the worst ones, is not counted: single points miss thin parts
-in clean rigs, too."""
+"""The worst points, this share of all, are not counted: single points miss thin parts in clean rigs,
+too."""
 MIN_RESIDUAL_PX = 0.16
 """Outlines with a smaller residual, pixels, agree; clean rigs of 8 to 20 cameras stay below it."""
 RESOLUTION_PX = 0.01
@@ -75,7 +75,7 @@ class OutlierThresholds:
     left_out_removed: float = 0.06
     """An outlier that removes more than this share is left out."""
     left_out_removed_of_few: float = 0.2
-    """The same share in rigs of at most `FEW_CAMERAS` cameras."""
+    """`left_out_removed` in rigs of at most `FEW_CAMERAS` cameras."""
     outside: float = 0.15
     """An outlier has more than this share of its mask outside the others' hull, beyond 3 times the median."""
     left_out_outside: float = 0.3

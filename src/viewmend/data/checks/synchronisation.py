@@ -34,11 +34,11 @@ MIN_EXPLAINED = 0.002
 """A camera is delayed if its mask of another frame lets the hull explain more of all masks, by this
 share of them."""
 MIN_EXPLAINED_SHARE = 0.3
-"""It must also explain this share of what the hull left unexplained: with a calibration that is
-off, other frames fit a little better by chance."""
+"""The mask of another frame must also explain this share of what the hull left unexplained: if the
+calibration is wrong, other frames fit a little better by chance."""
 SHARPER = 1.015
-"""Images are delayed if those of another frame have this much stronger edges along the
-outlines of the masks."""
+"""Images are delayed if the images of another frame have stronger edges along the outlines of the
+masks, by this factor."""
 MIN_OUTLINE_FRAMES = 3
 """Edges are compared by the median of this many frames or more, since one frame may be damaged."""
 

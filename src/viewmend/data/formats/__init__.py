@@ -56,7 +56,7 @@ FORMAT_NAMES = ("plain", *FORMATS)
 
 
 def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
-    """The format, and the file that identifies it; of `names`, the first one that matches."""
+    """The first of these formats that matches, and the file that identifies it; "" and None if none does."""
     for name in names:
         file = FORMATS[name].find(path)
         if file is not None:

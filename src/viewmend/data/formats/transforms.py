@@ -180,7 +180,7 @@ def _posed(folder: Path, file: _File, frame: _Entry, alpha: bool) -> PosedImage:
 
 
 def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
-    """Warn of keys whose effect is unknown; raise a ValueError for those that give images or poses another meaning."""
+    """Warn of keys whose effect is unknown; raise a ValueError for keys that change the meaning of images or poses."""
     parts = [parsed, *parsed["frames"]]
     other = [key for key in OTHER_MEANING if any(part.get(key) for part in parts)]
     if any(part.get("transform_matrix_start") != part.get("transform_matrix_end") for part in parts):

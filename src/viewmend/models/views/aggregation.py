@@ -19,9 +19,9 @@ class AggregatedSamples(NamedTuple):
     """Ray samples after aggregation over cameras."""
 
     colour: Float[Tensor, "ray sample 3"]
-    """RGB on black, the weighted mean of the cameras."""
+    """The weighted mean of the cameras' RGB on black."""
     mask: Float[Tensor, "ray sample 1"]
-    """Their masks, likewise."""
+    """The weighted mean of the cameras' masks."""
     features: Float[Tensor, "ray sample feature"]
     score: Float[Tensor, "ray sample"]
     """Evidence that the surface is at the sample."""

@@ -259,9 +259,6 @@ def run_tiled(
     odd kernels that keep the size, and layers that act on single pixels.
     """
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
-    cell_halo = -(-halo // CELL_PX) + 1
-    cut = CELL_PX * cell_halo - halo
-
     # The tiles that contain a pixel
     across = -(-shape[1] // TILE_PX)
     tile_of_pixel = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
@@ -270,16 +267,11 @@ def run_tiled(
     tile_columns = tiles % across
     at_border = _reaches_border(tile_rows, tile_columns, halo, shape)
 
-    # Windows of all tiles: indices of values, and of cells
+    # The indices of values and of cells in each tile
+    value_windows = _value_windows(pixels, shape, halo)
+    cell_windows = _cell_windows(cells, halo)
     padded_values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
-    padded_index = F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1)
-    index = _windows(padded_index, halo, TILE_PX)[0]
-    grid = cells.shape[2:]
     cell_values = cells[0].movedim(0, 2).flatten(0, 1)
-    numbers = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
-    frame = _frame(grid, cell_halo, TILE_PX // CELL_PX)
-    padded_numbers = F.pad(numbers, frame, mode="replicate").long()
-    near = _windows(padded_numbers[0], cell_halo, TILE_PX // CELL_PX)[0]
 
     outputs = []
     first = 0
@@ -288,14 +280,48 @@ def run_tiled(
         size = next(size for size in AT_ONCE if size <= len(tiles) - first)
         rows = tile_rows[first : first + size]
         columns = tile_columns[first : first + size]
-        coarse = cell_values[near[rows, columns]].movedim(3, 1)  # interpolation is faster with channels last
-        fine = F.interpolate(coarse, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-        fine = fine[:, :, cut:-cut, cut:-cut].to(values)
-        x = torch.cat([fine.movedim(1, 3), padded_values[index[rows, columns]]], 3).movedim(3, 1)
+        upsampled = _upsample_windows(cell_values[cell_windows[rows, columns]], halo).to(values)
+        x = torch.cat([upsampled, padded_values[value_windows[rows, columns]]], 3).movedim(3, 1)
         inside = _inside(rows, columns, halo, shape).to(x) if at_border else None
         outputs.append(_run_unpadded(layers, x, inside))
         first += size
     return torch.cat(outputs)[own, :, pixels[:, 0] % TILE_PX, pixels[:, 1] % TILE_PX]
+
+
+def _cell_halo(halo: int) -> int:
+    """The halo of tiles in cells: one cell more than is needed, for the interpolation."""
+    return -(-halo // CELL_PX) + 1
+
+
+def _value_windows(
+    pixels: Pixels, shape: torch.Size, halo: int
+) -> Int[Tensor, "tile_row tile_column height width"]:
+    """The index in `pixels` of each pixel of each tile with its halo; -1 where there is none."""
+    index = F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1)
+    return _windows(index, halo, TILE_PX)[0]
+
+
+def _cell_windows(
+    cells: Float[Tensor, "1 feature rows columns"], halo: int
+) -> Int[Tensor, "tile_row tile_column height width"]:
+    """The number of each cell of each tile with its halo; cells beyond the border are those on it."""
+    grid = cells.shape[2:]
+    numbers = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
+    frame = _frame(grid, _cell_halo(halo), TILE_PX // CELL_PX)
+    padded = F.pad(numbers, frame, mode="replicate").long()
+    return _windows(padded[0], _cell_halo(halo), TILE_PX // CELL_PX)[0]
+
+
+def _upsample_windows(
+    coarse: Float[Tensor, "tile rows columns feature"], halo: int
+) -> Float[Tensor, "tile height width feature"]:
+    """Windows of cells at full resolution, cut to the halo of the pixels."""
+    # Interpolation is faster with channels last in memory
+    fine = F.interpolate(
+        coarse.movedim(3, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False
+    ).movedim(1, 3)
+    cut = CELL_PX * _cell_halo(halo) - halo
+    return fine[:, cut:-cut, cut:-cut]
 
 
 def _frame(shape: Sequence[int], halo: int, tile: int) -> tuple[int, int, int, int]:

@@ -189,7 +189,7 @@ class SourceCameras:
     def of(
         cls, views: ContextViews, silhouettes: Silhouettes | None, context: ContextProvider | None = None
     ) -> "SourceCameras":
-        """Cameras with their pyramids, which `context` caches; without `silhouettes`, those of `views` are taken."""
+        """Cameras with their pyramids, which `context` caches; `silhouettes` are the masks of `views` by default."""
         if silhouettes is None:
             silhouettes = Silhouettes(_masks(views), views.frame.cameras)
         if context is None:
@@ -265,7 +265,7 @@ class SourceCameras:
         return found
 
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> tuple[MipLevels, MipLevels]:
-        """The fine and the wide level of the source cameras, and those of the silhouettes."""
+        """The fine and the wide level of each source camera, and of each camera of the silhouettes."""
         images, outlines = self.levels(viewer, step_px, scale)
         return (
             MipLevels.of(self.pyramids, list(zip(*images, strict=True))),
@@ -282,7 +282,7 @@ class SourceCameras:
 
     @property
     def _parts(self) -> list[tuple[Cameras, tuple[Pyramid, ...]]]:
-        """The source cameras, and those of the silhouettes, with their pyramids."""
+        """The source cameras and the cameras of the silhouettes, each with their pyramids."""
         return [(self.cameras, self.pyramids), (self.silhouettes.cameras, self.silhouette_pyramids)]
 
 

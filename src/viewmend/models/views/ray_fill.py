@@ -200,11 +200,31 @@ class RayFill(Network, Fill):
         # Initial weights: cameras near the viewer that do not have the point far behind the proxy
         prior = at.in_view * (4 * at.viewing_cosine).exp() * (-4 * at.depth_difference).sigmoid()
         prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
+        compared = self._compare(at, colours, prior, smallest_masks)
+
+        # What the trusted cameras show, and how much they agree
+        scores = self.trust(compared).float() + (prior + 1e-4).log()
+        trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
+        agreed = (trust * colours).sum(2)
+        spread = CONTRAST * (trust * (colours - agreed[:, :, None]) ** 2).sum(2)
+        point = [(trust * compared).sum(2), agreed, spread, smallest_masks, (trust**2).sum(2)]
+        return agreed[..., :3], self.point(torch.cat(point, -1))
+
+    def _compare(
+        self,
+        at: CameraFeatures,
+        colours: Float[Tensor, "pixel point view colour"],
+        prior: Float[Tensor, "pixel point view 1"],
+        smallest_masks: SmallestMasks,
+    ) -> Float[Tensor, "pixel point view feature"]:
+        """Compares each camera with all of them, which are weighted by `prior`.
+
+        The first layer runs once per point, instead of once per camera, on what the cameras share.
+        """
         mean = (prior * colours).sum(2, keepdim=True)
         variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
 
-        # Compare each camera with all of them; channels are in the order that the layers were trained on. The first
-        # layer runs once per point, instead of once per camera, on what the cameras share.
+        # Shipped weights depend on the order of these channels
         ordered = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
         looked = self.look(ordered)
         first = self.compare[0]
@@ -216,15 +236,7 @@ class RayFill(Network, Fill):
         shared = torch.cat([mean[:, :, 0], variance[:, :, 0], together, smallest_masks[:, :, ::2]], -1)
         shared_weight = torch.cat([of_mean, of_variance, of_look, of_masks], 1)
         added = F.linear(shared, shared_weight, first.bias)
-        compared = self.compare[1:](own + added[:, :, None])
-
-        # What the trusted cameras show, and how much they agree
-        scores = self.trust(compared).float() + (prior + 1e-4).log()
-        trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
-        agreed = (trust * colours).sum(2)
-        spread = CONTRAST * (trust * (colours - agreed[:, :, None]) ** 2).sum(2)
-        point = [(trust * compared).sum(2), agreed, spread, smallest_masks, (trust**2).sum(2)]
-        return agreed[..., :3], self.point(torch.cat(point, -1))
+        return self.compare[1:](own + added[:, :, None])
 
 
 def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:

@@ -405,7 +405,7 @@ def project_rays(rays: Rays, cameras: Cameras) -> Projections:
 
 
 def _project_into_all(rays: Rays, sources: SourceCameras) -> tuple[Projections, Projections]:
-    """Projections into the source cameras, and into those of the silhouettes."""
+    """Projections into the source cameras, and into the cameras of the silhouettes."""
     parts = sources.cameras, sources.silhouettes.cameras
     if torch.compiler.is_exporting():  # which cannot split a number of cameras that it does not know
         images, outlines = parts

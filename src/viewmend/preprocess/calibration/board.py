@@ -35,7 +35,7 @@ MIN_PIXELS = 12
 MAX_STEP_PX = 0.5
 """Largest move of a corner in one step, pixels."""
 MAX_MOVE_PX = 2.5
-"""Largest move of a corner in all, pixels; one that would move further stays where it was
+"""Largest total move of a corner, pixels. A corner that would move further stays where it was
 detected."""
 OUTLIER_PX = 1.5
 """Corners farther than this many pixels from the homography of the others are ignored."""

@@ -25,16 +25,16 @@ DETECTOR_PX = 224
 SEGMENTER_PX = 256
 """The input of the segmenter has this side, pixels."""
 MAX_PEOPLE = 6
-"""People per image; of more, those that the detector is surest of."""
+"""At most this many people per image are segmented: those with the highest detection scores."""
 MIN_SCORE = 0.5
 """Least detection score of a person, and presence score at which a person is tracked."""
 MAX_OVERLAP = 0.3
 """Detections with a larger IoU are the same person."""
 ROI_SCALE = 1.25
-"""Side of the square around a person over the diameter of the circle that the landmarks span."""
+"""The square around a person is this many times as wide as the circle that the landmarks span."""
 OUTWARD = 0.6
-"""Added to the segmenter's logits, whose outlines lie inside those of people: IoU 0.01 higher on
-two captures."""
+"""Added to the logits of the segmenter, whose outlines are too narrow. IoU is 0.01 higher on two
+captures."""
 DETECT_EVERY = 15
 """Images after which the detector looks for further people while some are tracked."""
 GUIDED_SCORE = 0.05
