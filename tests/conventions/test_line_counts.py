@@ -7,12 +7,12 @@ import pytest
 from conventions.line_counts import MAX_LOCALS, MAX_STATEMENTS, SRC, count_file, count_packages, format_table
 
 CEILINGS = {
-    "parallel": 2,
+    "parallel": 0,
     "walruses": 30,
-    "prepositions": 3,
+    "prepositions": 1,
     "late_constants": 5,
-    "statements": 2,
-    "locals": 10,
+    "statements": 1,
+    "locals": 9,
 }
 """The most of each pattern in the package."""
 MAX_LONG_LINES_PERCENT = 1.5

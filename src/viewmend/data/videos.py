@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
+    from av.video.stream import VideoStream
 
 VIDEO_SUFFIXES = (
     *(
@@ -157,16 +158,12 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         stream = container.streams.video[0]
         codec = stream.codec_context
         base = stream.time_base or Fraction(1, 25)
-        frames = stream.frames
         rate = stream.average_rate or stream.guessed_rate
         shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
         packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
-        reordered = codec.has_b_frames
+        may_be_delayed = stream.frames == 0 and codec.has_b_frames
         names = set(container.format.name.split(","))
-        notes = [container.metadata, *(other.metadata for other in (stream, *container.streams))]
-        timecodes = [
-            note[key] for note in notes for key in note if key.lower() == "timecode"
-        ]  # Matroska: capitals
+        timecode = _timecode(container, stream)
     head = list(islice(_decoded(path), CHECKED_FRAMES))
     if not head:
         raise CaptureError(f"{path}: expected a video, got a file without decodable frames; export it again")
@@ -182,7 +179,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
             base = 1 / (rate or Fraction(25))
     seconds = np.array([float(time * base) for time in times or ()])
     fps = _measured_rate(seconds, None if rate is None else float(rate), float(base))
-    delayed = frames == 0 and reordered and fps is not None and seconds[0] <= MAX_ENCODER_DELAY / fps
+    delayed = may_be_delayed and fps is not None and seconds[0] <= MAX_ENCODER_DELAY / fps
     if not names & ABSOLUTE_TIMES or ("mp4" in names and delayed):
         seconds -= seconds[0]
     height, width = _upright(np.empty((head[0].height, head[0].width), np.uint8), head[0]).shape
@@ -197,8 +194,17 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         keys,
         is_timed=not names & WITHOUT_TIMES,
         is_interlaced=2 * sum(frame.interlaced_frame for frame in head) > len(head),
-        timecode=timecodes[0] if timecodes else None,
+        timecode=timecode,
     )
+
+
+def _timecode(container: "InputContainer", stream: "VideoStream") -> str | None:
+    """The timecode in the metadata of a film: of the container, else of its video, else of another stream."""
+    for place in (container, stream, *container.streams):
+        for key, value in place.metadata.items():
+            if key.lower() == "timecode":  # Matroska has capitals
+                return value
+    return None
 
 
 def _timestamps(

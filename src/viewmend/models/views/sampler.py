@@ -276,15 +276,14 @@ def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
 def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     """The reference of `sample_fill_rays`."""
     images = sources.images
-    depth = sources.views.depth[:, None]
-    masks = sources.silhouettes.mask[:, None]
+    depth = MipLevels.full(sources.views.depth[:, None])
     shape_side, half_colour_side, outline_side = _box_sides(*sources.mask_sums)
 
     # Distance behind the proxy: the mean depth of the pixels around that have one
     at, at_outline = _project_into_all(rays, sources)
     fine = sample_level(MipLevels.full(images), at, 5)
     coverage = fine[..., 4]
-    surface = 255 * sample_level(MipLevels.full(depth), at, 1)[..., 0] / coverage.clamp_min(MIN_COVERAGE)
+    surface = 255 * sample_level(depth, at, 1)[..., 0] / coverage.clamp_min(MIN_COVERAGE)
     behind = torch.where(coverage > MIN_COVERAGE, at.z_m - surface, 0.0) / rays.scale.size_m
 
     # What each camera shows
@@ -293,13 +292,10 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
         half = half.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
     colours = BoxSums.of(half).means(at.uv_px / 2, half_colour_side)
-    wide = torch.cat([colours, shapes], -1)
-    features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
+    around = torch.cat([colours, shapes], -1)
+    features = _camera_features(rays, sources, at, fine[..., :4], around, behind, torch.tanh)
 
-    # The silhouettes of the whole rig
-    outlines = sample_level(MipLevels.full(masks), at_outline, 1)
-    mean_outlines = BoxSums.of(masks).means(at_outline.uv_px, outline_side)
-    smallest = _smallest_masks(at_outline, torch.stack([outlines[..., 0], mean_outlines[..., 0]]))
+    smallest = _smallest_rig_masks(sources, at_outline, outline_side)
     return RaySamples(features, 0 * features[..., 0], F.pad(smallest, (STATISTICS - smallest.shape[-1], 0)))
 
 
@@ -491,6 +487,16 @@ def _box_sides(
     source_px = (mask_sums / 255).mean().sqrt()
     rig_px = (outline_sums / 255).mean().sqrt()
     return box_side_px(AROUND, source_px), box_side_px(PATCH / 2, source_px), box_side_px(AROUND, rig_px)
+
+
+def _smallest_rig_masks(
+    sources: SourceCameras, at: Projections, side: Int[Tensor, ""]
+) -> Float[Tensor, "ray sample 4"]:
+    """The smallest masks of all cameras of the rig, single and averaged over boxes of this side."""
+    masks = sources.silhouettes.mask[:, None]
+    outlines = sample_level(MipLevels.full(masks), at, 1)
+    means = BoxSums.of(masks).means(at.uv_px, side)
+    return _smallest_masks(at, torch.stack([outlines[..., 0], means[..., 0]]))
 
 
 def _smallest_masks(
