@@ -120,7 +120,7 @@ def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
     with busy("thinking"):
         sleep(0.12)
     said = capsys.readouterr().err.splitlines()
-    assert {"counting: 0 of 2", "counting: 1 of 2, 0 s left", "thinking"} <= set(said)
+    assert {"counting: 0 of 2", "counting: 1 of 2, 0 s left", "thinking: 0 s so far"} <= set(said)
     assert [console._duration(s) for s in (80.0, 1200.0, 9000.0)] == ["80 s", "20 min", "2.5 h"]
     sleep(0.12)
     assert capsys.readouterr().err == "", "an end is an end"

@@ -82,7 +82,8 @@ def _duration(seconds: float) -> str:
 def busy(description: str) -> Iterator[None]:
     """Show that work of unknown length is going on; lines on standard error if it is not a terminal."""
     if not sys.stderr.isatty():
-        with Heartbeat(lambda: description):
+        start = time.monotonic()
+        with Heartbeat(lambda: f"{description}: {_duration(time.monotonic() - start)} so far"):
             yield
         return
     from rich.console import Console
