@@ -192,8 +192,9 @@ def poses(name: str, count: int, size_px: int) -> Iterator[LeaveOneOutFrame]:
         return
     kind, _, inputs = name.partition(":")
     scenes = procedural_set(1, size_px) if kind == "P" else capture_set(Path(kind), inputs or "all")
-    chosen = [scenes[len(scenes) * n // count] for n in range(min(count, len(scenes)))]
-    times = math.ceil(count / len(chosen))
+    number_of_scenes = min(count, len(scenes))
+    chosen = [scenes[len(scenes) * n // number_of_scenes] for n in range(number_of_scenes)]
+    times = math.ceil(count / number_of_scenes)
     for scene in chosen:
         for number, frame in enumerate(scene.frames()):
             if number == times:

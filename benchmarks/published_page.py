@@ -27,7 +27,7 @@ BLOCK_BYTES = 16384
 """Bytes that are sent at a time."""
 TURNING_S = 5.0
 """Seconds of turning the view to count the painted ones."""
-WAIT_MS = 180_000
+WAIT_MS = 900_000
 """The first picture may take this long, milliseconds."""
 SCREENS = {
     "desktop": ((1440, 900), False),

@@ -41,8 +41,8 @@ PHOTOGRAPHS = {
 """The address and the key that give each picture of the page."""
 SETTLED_MS = 5000
 """A completed view has replaced the drawn one after this time, milliseconds."""
-WAIT_MS = 120_000
-"""The page has this long to show a completed view, milliseconds."""
+WAIT_MS = 300_000
+"""The page has this long for each step towards a completed view, milliseconds."""
 
 
 def main() -> None:
@@ -89,13 +89,14 @@ def photograph_page(out: Path) -> None:
         browser = control.chromium.launch(executable_path=executable, args=["--no-sandbox"])
         for name, (query, key) in PHOTOGRAPHS.items():
             page = browser.new_page(viewport={"width": PAGE_PX[0], "height": PAGE_PX[1]})
+            page.set_default_timeout(WAIT_MS)  # the machine may be busy
             page.goto(address.rstrip("/") + "/" + query)
-            page.wait_for_selector("#picture[data-look]", timeout=WAIT_MS)
+            page.wait_for_selector("#picture[data-look]")
             if key:
                 page.keyboard.press(key)
             page.wait_for_timeout(2000)
-            page.wait_for_selector("#picture[data-full=true]", timeout=WAIT_MS)
-            page.wait_for_selector("#refining", state="hidden", timeout=WAIT_MS)
+            page.wait_for_selector("#picture[data-full=true]")
+            page.wait_for_selector("#refining", state="hidden")
             page.wait_for_timeout(SETTLED_MS)
             with tempfile.TemporaryDirectory() as folder:
                 page.screenshot(path=f"{folder}/page.png")
