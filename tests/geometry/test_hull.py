@@ -167,7 +167,7 @@ def test_cuda_equals_cpu():
 
 
 def test_an_image_has_the_points_on_its_first_borders_and_none_on_its_last():
-    """A camera with P = [1 | 0] sees (u, v, 1) at (u, v)."""
+    """The camera sees (u, v, 1) at (u, v) of the mask, which is pooled by 2 to 4 x 3 pixels."""
     points = [
         ((0.0, 0.0, 1.0), True),
         ((3.99, 2.99, 1.0), True),
@@ -181,7 +181,25 @@ def test_an_image_has_the_points_on_its_first_borders_and_none_on_its_last():
     ]
     scratch = np.zeros((8, len(points)), np.float32)
     scratch[:3] = np.array([point for point, _ in points]).T
-    locate(np.eye(3, 4), (0.0, 0.0, 0.0), 1.0, np.array([4, 3]), 1, len(points), scratch)
+    P = np.diag([2.0, 2.0, 1.0]) @ np.eye(3, 4)
+    locate(P, (0.0, 0.0, 0.0), 1.0, np.array([8, 6]), 2, len(points), scratch)
     u, v = scratch[6:]
     assert (u >= 0).tolist() == [seen for _, seen in points]
     assert u[1] == pytest.approx(3.99) and v[1] == pytest.approx(2.99)
+
+
+def test_voxels_are_located_in_the_pooled_mask():
+    """A general camera, whose rows all depend on all coordinates, against the projection in 64 bits."""
+    rng = np.random.default_rng(0)
+    P = rng.uniform(-9, 9, (3, 4))
+    P[2] = rng.uniform(0.5, 1, 4)
+    P[:, 3] += [50, 50, 5]
+    origin = np.array([0.3, 0.5, 0.7])
+    voxels = rng.integers(0, 8, (30, 3))
+    scratch = np.zeros((8, len(voxels)), np.float32)
+    scratch[:3] = voxels.T
+    locate(P, tuple(origin), 0.25, np.array([60, 50]), 2, len(voxels), scratch)
+    u, v, z = P[:, :3] @ (origin + 0.25 * voxels).T + P[:, 3:]
+    assert ((u > 0) & (v > 0) & (u / z < 60) & (v / z < 50)).all(), "all are in view"
+    np.testing.assert_allclose(scratch[6], u / z / 2, rtol=1e-5)
+    np.testing.assert_allclose(scratch[7], v / z / 2, rtol=1e-5)
