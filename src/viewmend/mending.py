@@ -24,7 +24,6 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import Background, composite
-from viewmend.predicted_mask import MaskPredictor
 from viewmend.scenes.held_out import Protocol, reveal
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
@@ -70,6 +69,11 @@ class MendStep:
         return composite(self.background, self.completed.view.cut_rgb, self.completed.view.silhouette)
 
 
+def default_protocol(inpainter: Inpainter) -> Protocol:
+    """The protocol of models that need the view's mask is 'predicted-mask', that of all others 'strict'."""
+    return "predicted-mask" if inpainter.needs_mask else "strict"
+
+
 class Mender(ViewSequence):
     """Completes the views of one viewer, frame by frame, and scores them."""
 
@@ -82,16 +86,15 @@ class Mender(ViewSequence):
         quality: RenderQuality | None = None,
         error_model: Inpainter | None = None,
         protocol: Protocol = "strict",
-        mask_model: Inpainter | None = None,
     ) -> None:
         """Create a viewer of an empty stream, as `ViewSequence` does.
 
         `protocol` says what `mend` may know of the mask of the held-out camera; with
-        'predicted-mask', `mask_model` predicts it.
+        'predicted-mask', `error_model` predicts it.
         """
+        config = replace(config or StreamConfig(memory_mb=None), predict_mask=protocol == "predicted-mask")
         super().__init__(inpainter, config, bounds, exclude, quality, error_model)
         self._protocol: Protocol = protocol
-        self._masks = None if mask_model is None else MaskPredictor(mask_model, self.stream.config, bounds)
         self._scorers: Scorers | None = None
 
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
@@ -106,8 +109,6 @@ class Mender(ViewSequence):
         """
         target_mask, carving = reveal(self._protocol, truth)
         cached = self.add_frame(frame, carving)
-        if self._masks is not None:
-            target_mask = self._masks.predict(cached, target, self._exclude)
         made = self.view(target, frame.time, target_mask=target_mask)
         iou = _input_iou(cached)
         if truth is None:

@@ -27,7 +27,7 @@ from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State, check_exclude
 from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
-from viewmend.rendering.error_mask import Evidence, decide_error_mask
+from viewmend.rendering.error_mask import Evidence, decide_error_mask, with_rim
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.types import (
     CompletedView,
@@ -66,6 +66,9 @@ class StreamConfig:
     """Parameters of the fused geometry."""
     render: RenderConfig = field(default_factory=RenderConfig)
     """How views are rendered, and which of their pixels are inpainted."""
+    predict_mask: bool | None = None
+    """Whether M_t is predicted in views where it is not known: the alpha of the error model. None: for
+    inpainters that need it, in streams with an error model."""
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 2000.0
@@ -135,13 +138,13 @@ class Stream:
             inpainter: completes the views, e.g. `load_inpainter("views")`.
             config: parameters of geometry, rendering and memory.
             bounds: the volume that may contain the subject; None to find it from the masks.
-            error_model: predicts errors and depth in place of `inpainter`, if that does not; needed
-                for the error rule 'predicted', for `RenderQuality.refine_fraction` and for the
-                geometry 'fused' (`registry.error_model_for`).
+            error_model: predicts errors, depth and masks in place of `inpainter`, if that does not;
+                needed for the error rule 'predicted', for `RenderQuality.refine_fraction`, for the
+                geometry 'fused' and for `StreamConfig.predict_mask` (`registry.error_model_for`).
 
         Raises:
             ValueError: `inpainter` is a name, a class or anything else than an inpainter; or the
-                geometry is 'fused', and no model predicts depth.
+                geometry is 'fused', or masks are to be predicted, and no model can do so.
         """
         if not isinstance(inpainter, Inpainter):
             raise ValueError(
@@ -160,9 +163,24 @@ class Stream:
                 f"expected a model that predicts depth for the geometry 'fused', got {type(inpainter).__name__} alone; "
                 "give one: Stream(..., error_model=load_inpainter('views')), or use the geometry 'hull'"
             )
+        self._mask_model = self._find_mask_model()
         self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
         self._warned = False
         """Whether a warning has said that the memory does not hold the window."""
+
+    def _find_mask_model(self) -> Inpainter | None:
+        """The model whose alpha is M_t where that is not known; None where M_t is not predicted."""
+        wanted = self.config.predict_mask
+        if wanted is None:
+            wanted = self.inpainter.needs_mask and self.error_model is not None
+        if not wanted:
+            return None
+        if self.error_model is None and not self.inpainter.predicts_errors:
+            raise ValueError(
+                f"expected a model that predicts masks, which predict_mask needs, got "
+                f"{type(self.inpainter).__name__} alone; give one: Stream(..., error_model=load_inpainter('views'))"
+            )
+        return self.error_model or self.inpainter
 
     @property
     def error_rule(self) -> str:
@@ -338,6 +356,30 @@ class Stream:
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
 
+    def predict_mask(
+        self, view: IncompleteView, exclude: Sequence[str] = ()
+    ) -> Float[Tensor, "height width"]:
+        """M_t of a rendered view whose mask is not known: the alpha that a model predicts, in [0, 1].
+
+        Raises:
+            ValueError: masks are not predicted in this stream (`StreamConfig.predict_mask`).
+        """
+        model = self._mask_model
+        if model is None:
+            raise ValueError(
+                "expected a stream that predicts masks, got one with predict_mask off; turn it on"
+            )
+        margin_px = model.crop_margin_px(RenderQuality())
+        view = replace(view, error=with_rim(view.mask))
+        crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
+        part = crop.of_view(view)
+        context = self.context_provider(exclude=exclude)
+        with heavy_operations():
+            completed, _ = model.step_on(self.config.background, part, context, model.initial_state())
+        found = crop.uncropped(replace(part, target_mask=completed.opacity.clamp(0, 1)), view.camera)
+        assert found.target_mask is not None, "it was just given"
+        return found.target_mask
+
     def advance(self, view: IncompleteView, viewer: State | None = None) -> State | None:
         """The state after a view whose completion is not needed; None if only `mend` can compute it."""
         inpainter = self.inpainter
@@ -452,6 +494,13 @@ class Stream:
         context = self.context_provider(quality, exclude)
         start = now_s(part.rgb.device)
 
+        # predict the subject's mask, if it is needed and not known
+        stop_if_cancelled()
+        if self._mask_model is not None and part.target_mask is None and _allows_mask(quality):
+            part = replace(part, target_mask=self.predict_mask(part, exclude))
+            if whole is not None:
+                whole = replace(whole, target_mask=crop.uncropped(part, whole.camera).target_mask)
+
         # decide which pixels are to be inpainted
         stop_if_cancelled()
         masked, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
@@ -491,3 +540,8 @@ class Stream:
             return {}
         self._frames.move_to_end(time)
         return self._frames[time].encoded
+
+
+def _allows_mask(quality: RenderQuality) -> bool:
+    """Whether a view of this quality may cost the prediction of its mask, which takes as long as a view by `views`."""
+    return quality.mend and quality.context_times is None

@@ -8,7 +8,8 @@ from models.plates import Rig, context, view
 from reference.ball import BallCapture, camera_at, ring
 
 from viewmend.geometry.hull import HullConfig
-from viewmend.mending import Mender
+from viewmend.mending import Mender, default_protocol
+from viewmend.models.base import RenderQuality
 from viewmend.models.checkpoint import build, load_inpainter
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import opaque_in_mask
@@ -17,7 +18,7 @@ from viewmend.models.paper.tokenizer import build_context_input, build_target_in
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig, select_closest
 from viewmend.scenes.held_out import LeaveOneOut, reveal
-from viewmend.stream import Stream
+from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig
 from viewmend.training.samples import HeldOutCamera
 from viewmend.types import CompletedView, check_target_mask
@@ -66,7 +67,7 @@ class HalfTheSubject(SmoothFill):
 
 
 def test_a_predicted_mask_cuts_the_view_and_the_truth_is_not_looked_at():
-    mender = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject())
+    mender = Mender(Telea(), protocol="predicted-mask", error_model=HalfTheSubject())
     frame = BallCapture(ring(6), 1).read(0)
     truth = truth_with_half_a_mask()
     step = mender.mend(frame, TARGET, truth)
@@ -75,11 +76,37 @@ def test_a_predicted_mask_cuts_the_view_and_the_truth_is_not_looked_at():
     assert torch.equal(step.completed.opacity, step.completed.view.mask * used)
     assert not step.completed.rgb[:, used == 0].any()
     emptied = replace(truth, mask=truth.mask * 0)
-    again = Mender(Telea(), protocol="predicted-mask", mask_model=HalfTheSubject()).mend(
+    again = Mender(Telea(), protocol="predicted-mask", error_model=HalfTheSubject()).mend(
         frame, TARGET, emptied
     )
     assert torch.equal(again.completed.rgb, step.completed.rgb)
     assert reveal("predicted-mask", truth) == (None, None)
+
+
+def test_a_model_that_needs_a_mask_gets_a_predicted_one():
+    class NeedsMask(Telea):
+        needs_mask = True
+
+    frame = BallCapture(ring(6), 1).read(0)
+    stream = Stream(NeedsMask(), error_model=HalfTheSubject())
+    stream.add_frame(frame)
+    view = stream.view(TARGET).completed
+    used = view.view.target_mask
+    assert used is not None and used.any() and not used[:, used.shape[1] // 2 :].any()
+    mended_view = stream.mend(stream.render(TARGET)).completed
+    assert torch.equal(mended_view.view.target_mask, used)
+    assert torch.equal(mended_view.rgb, view.rgb)
+    given = stream.view(TARGET, target_mask=torch.ones_like(used)).completed.view
+    assert (given.target_mask[given.mask > 0] == 1).all()
+    assert stream.view(TARGET, quality=RenderQuality(mend=False)).completed.view.target_mask is None
+    strict = Stream(NeedsMask(), StreamConfig(predict_mask=False), error_model=HalfTheSubject())
+    strict.add_frame(frame)
+    assert strict.view(TARGET).completed.view.target_mask is None
+    with pytest.raises(ValueError, match="turn it on"):
+        strict.predict_mask(strict.render(TARGET))
+    with pytest.raises(ValueError, match="predicts masks"):
+        Stream(Telea(), StreamConfig(predict_mask=True))
+    assert default_protocol(NeedsMask()) == "predicted-mask" and default_protocol(Telea()) == "strict"
 
 
 def test_the_hull_with_the_target_mask_lies_inside_of_it():

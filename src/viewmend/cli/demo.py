@@ -54,7 +54,7 @@ def run(options: Options) -> int:
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import in_words
     from viewmend.data.source import prefetch
-    from viewmend.mending import Mender, MendSummary
+    from viewmend.mending import Mender, MendSummary, default_protocol
     from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig
     from viewmend.studio.stage import Studio, StudioConfig
@@ -68,11 +68,17 @@ def run(options: Options) -> int:
     studio = Studio(config)
     say(f"scene: {studio.performer.description}")
     path = _path(options)
-    error_model = error_model_for(inpainter) if render.error_rule == "predicted" else None
+    protocol = default_protocol(inpainter)
+    needs_model = render.error_rule == "predicted" or protocol == "predicted-mask"
+    error_model = error_model_for(inpainter) if needs_model else None
     mender = Mender(
-        inpainter, StreamConfig(render=render, memory_mb=None), studio.bounds, error_model=error_model
+        inpainter,
+        StreamConfig(render=render, memory_mb=None),
+        studio.bounds,
+        error_model=error_model,
+        protocol=protocol,
     )
-    summary = MendSummary()
+    summary = MendSummary(protocol)
     steps = []
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)

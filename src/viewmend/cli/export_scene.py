@@ -75,8 +75,9 @@ def run(options: Options) -> int:
     opened = open_masked(options.capture, format=options.format)
     times = chosen_times(options.frames, len(opened.frame_ids))
     inpainter = load_named(options.model, options.device, options.precision)
-    depth_model = error_model_for(inpainter, options.device) if options.geometry == "fused" else None
-    stream = Stream(inpainter, StreamConfig(geometry=options.geometry), opened.bounds, depth_model)
+    needs_model = inpainter.needs_mask or options.geometry == "fused"
+    error_model = error_model_for(inpainter, options.device) if needs_model else None
+    stream = Stream(inpainter, StreamConfig(geometry=options.geometry), opened.bounds, error_model)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
         prepared = asdict(options.preparation)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from viewmend.geometry.cameras import Cameras
     from viewmend.mending import Mender
     from viewmend.models.base import Inpainter
+    from viewmend.scenes.held_out import Protocol
 
 
 LARGE_PX = 1000
@@ -64,11 +65,11 @@ class Options:
     """Names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
-    protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
+    protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] | None = None
     """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and
     composites the view ('target-mask', as in the paper); its mask, which only carves the hull
     ('hull-with-target-mask'); or nothing, but the alpha that 'views' predicts stands for its mask
-    ('predicted-mask')."""
+    ('predicted-mask', the default of the paper's model; that of other models is 'strict')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea',
@@ -109,7 +110,7 @@ def run(options: Options) -> int:
     from viewmend.cli.mend_output import MendOutput, in_words
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
     from viewmend.data.source import prefetch
-    from viewmend.mending import MendSummary
+    from viewmend.mending import MendSummary, default_protocol
 
     # Open and prepare the capture
     options.view.config()  # raises errors of options before anything is read
@@ -119,12 +120,13 @@ def run(options: Options) -> int:
     times = chosen_times(options.frames, len(opened.frame_ids))
     usable = _usable(opened, times, held)
     inpainter = load_named(options.model, options.device, options.precision)
+    protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
 
     # Render and complete the views
-    mender = _make_mender(options, inpainter, capture.bounds, held)
+    mender = _make_mender(options, inpainter, capture.bounds, held, protocol)
     mender.background = (turntable and turntable.background) or mender.background
-    summary = MendSummary(options.protocol)
+    summary = MendSummary(protocol)
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
     frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])
     frame = None
@@ -160,7 +162,7 @@ def _check(options: Options) -> None:
         raise ValueError(
             "expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them"
         )
-    if options.leave_out is None and options.protocol not in ("strict", "predicted-mask"):
+    if options.leave_out is None and options.protocol not in (None, "strict", "predicted-mask"):
         raise ValueError(
             f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out"
         )
@@ -212,25 +214,26 @@ def _prepare(
 
 
 def _make_mender(
-    options: Options, inpainter: "Inpainter", bounds: "Bounds | None", held: tuple[str, ...]
+    options: Options,
+    inpainter: "Inpainter",
+    bounds: "Bounds | None",
+    held: tuple[str, ...],
+    protocol: "Protocol",
 ) -> "Mender":
     """The pipeline with all models that the options need."""
-    from viewmend.cli.checks import load_named
     from viewmend.mending import Mender
     from viewmend.models.base import RenderQuality
-    from viewmend.models.registry import MASK_MODEL, error_model_for
+    from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig
 
     render = options.view.config()
-    predicts_errors = render.error_rule == "predicted" or options.geometry == "fused"
-    error_model = error_model_for(inpainter, options.device) if predicts_errors else None
-    mask_model = None
-    if options.protocol == "predicted-mask":
-        mask_model = load_named(MASK_MODEL, options.device, options.precision)
+    error_model = None
+    if render.error_rule == "predicted" or options.geometry == "fused" or protocol == "predicted-mask":
+        error_model = error_model_for(inpainter, options.device, options.precision)
     memory_mb = None if inpainter.window_frames else KEPT_MB
     config = StreamConfig(geometry=options.geometry, render=render, memory_mb=memory_mb)
     quality = RenderQuality(top_k=options.top_k)
-    return Mender(inpainter, config, bounds, held, quality, error_model, options.protocol, mask_model)
+    return Mender(inpainter, config, bounds, held, quality, error_model, protocol)
 
 
 def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:

@@ -82,12 +82,12 @@ def run(options: Options) -> int:
     times = chosen_times(options.frames, len(capture.frame_ids))
     inpainter = load_named(options.model, options.device, options.precision)
     render = options.view.config()
-    needs_errors = options.geometry == "fused" or render.error_rule == "predicted"
+    needs_model = inpainter.needs_mask or options.geometry == "fused" or render.error_rule == "predicted"
     stream = Stream(
         inpainter,
         StreamConfig(geometry=options.geometry, render=render),
         capture.bounds,
-        error_model_for(inpainter, options.device) if needs_errors else None,
+        error_model_for(inpainter, options.device) if needs_model else None,
     )
     config = PublishConfig(
         title=options.title or capture.name,

@@ -22,8 +22,7 @@ from viewmend.metrics.image_quality import SsimWindow
 from viewmend.models.base import Inpainter, RenderQuality
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
-from viewmend.models.registry import MASK_MODEL, error_model_for, make_method
-from viewmend.predicted_mask import MaskPredictor
+from viewmend.models.registry import error_model_for, make_method
 from viewmend.scenes.held_out import LeaveOneOutScene, Protocol, reveal
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
@@ -118,7 +117,7 @@ def evaluate_scene(
     streams = [_MethodStream(name, settings, scorers, loaded) for name in methods]
     try:
         with torch.no_grad():
-            for frame in _frames(scene, settings, loaded):
+            for frame in _frames(scene, settings):
                 if frame.scored:
                     videos.add(frame.truth.rgb, frame.view.holes)
                 if frame.largest:
@@ -134,22 +133,23 @@ def evaluate_scene(
     return SceneRun(scene.name, tuple(stream.result() for stream in streams), images, videos.features())
 
 
-def _frames(scene: LeaveOneOutScene, settings: RunSettings, loaded: dict[str, Inpainter]) -> Iterator[_Frame]:
+def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     most = -1
     last = None
-    config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
-    depth_model = error_model_for(Unfilled(), settings.device) if config.geometry == "fused" else None
+    predict_mask = settings.protocol == "predicted-mask"
+    render = replace(settings.stream.render, error_rule="holes")
+    config = replace(settings.stream, render=render, predict_mask=predict_mask)
+    model = None
+    if predict_mask or config.geometry == "fused":
+        model = error_model_for(Unfilled(), settings.device, settings.precision)
     for frame in (to_device(own, settings.device) for own in scene.frames()):
-        stream = Stream(Unfilled(), config, frame.bounds, depth_model)
+        stream = Stream(Unfilled(), config, frame.bounds, model)
         target_mask, own = reveal(settings.protocol, frame.truth)
         carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)
-        if settings.protocol == "predicted-mask":
-            if MASK_MODEL not in loaded:
-                loaded[MASK_MODEL] = make_method(MASK_MODEL, settings.device, settings.precision)
-            predictor = MaskPredictor(loaded[MASK_MODEL], settings.stream, frame.bounds)
-            target_mask = predictor.predict(cached, frame.truth.cameras)
         view = stream.render(frame.truth.cameras, target_mask=target_mask)
+        if predict_mask:
+            view = replace(view, target_mask=stream.predict_mask(view))
         holes = int(view.holes.sum())
         scored = frame.inputs.time >= scene.scored_from
         origins = None if frame.seen is None else frame.seen.origins(view.source_views)
@@ -203,7 +203,8 @@ class _MethodStream:
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
         error_model = error_model_for(inpainter, settings.device) if predicted else None
         # The geometry comes with the frames, which all methods share.
-        config = replace(settings.stream, geometry="hull", background=settings.background)
+        # So does a mask, where it is known or predicted.
+        config = replace(settings.stream, geometry="hull", background=settings.background, predict_mask=False)
         quality = RenderQuality(top_k=settings.top_k)
         sequence = ViewSequence(inpainter, config, bounds, quality=quality, error_model=error_model)
         sequence.first_twice = new

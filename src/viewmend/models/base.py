@@ -253,6 +253,9 @@ class Inpainter:
     """Whether `predict_errors` is implemented."""
     predicts_depth: bool = False
     """Whether `predict_depth` is implemented."""
+    needs_mask: bool = False
+    """Whether it is made for views whose mask M_t is known. A stream predicts M_t where it is not, if
+    it has a model that can."""
     window_frames: int = 0
     """How many frames back `step` asks its context for. A stream keeps these frames, if its memory
     holds them."""

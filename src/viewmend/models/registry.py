@@ -21,9 +21,7 @@ from viewmend.utils.weight_files import MissingWeightsError
 REFERENCE = "telea"
 """Tables show the difference of every method from this one."""
 ERROR_MODEL = "views"
-"""The shipped model that predicts errors for inpainters that do not."""
-MASK_MODEL = "views"
-"""The shipped model whose alpha stands for a mask M_t that is not known."""
+"""The shipped model that predicts errors, depth and masks for inpainters that do not."""
 PRIVILEGED = ("rgvi",)
 """Methods that use the ground truth; their table rows say so."""
 METHODS: dict[str, str] = {
@@ -95,10 +93,10 @@ def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpa
     return made
 
 
-def error_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
-    """The model that predicts errors and depth for `inpainter`: the shipped `views`; None if it does so itself."""
-    predicts_both = inpainter.predicts_errors and inpainter.predicts_depth
-    return None if predicts_both else load_inpainter(ERROR_MODEL, device)
+def error_model_for(inpainter: Inpainter, device: str = "cpu", precision: str = "auto") -> Inpainter | None:
+    """The model that predicts errors, depth and masks for `inpainter`: `views`; None if it does so itself."""
+    predicts_all = inpainter.predicts_errors and inpainter.predicts_depth
+    return None if predicts_all else load_inpainter(ERROR_MODEL, device, precision)
 
 
 def own_background(name: str) -> str | None:

@@ -61,7 +61,12 @@ def holes(evidence: Evidence) -> Float[Tensor, "height width"]:
 
 def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:
     """1 on the proxy and a rim of `RIM_PX` around it, for inpainters that keep correct pixels themselves."""
-    return F.max_pool2d(evidence.mask[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
+    return with_rim(evidence.mask)
+
+
+def with_rim(mask: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """A mask that is larger by `RIM_PX` on all sides."""
+    return F.max_pool2d(mask[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
 
 
 def error_rule(name: str) -> ErrorRule:

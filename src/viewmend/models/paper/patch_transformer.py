@@ -61,6 +61,7 @@ class PatchTransformer(Network):
         super().__init__()
         self.config = config
         self.background = config.background
+        self.needs_mask = config.use_mask
         self.window_frames = max(config.n_c, config.k_w * config.n_w)
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
