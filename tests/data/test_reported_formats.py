@@ -104,6 +104,24 @@ def test_images_that_middlebury_and_riftcast_do_not_mention_are_named(tmp_path, 
     assert "does not mention are ignored: frame_0001/rgb/rgb_3.jpeg" in caplog.text
 
 
+def test_times_of_middlebury_are_frames(tmp_path):
+    rig = rig_of(4)
+    images = [
+        camera | {"image": f"images/{camera['name']}_{time:04d}.png", "name": f"{camera['name']}_{time:04d}"}
+        for time in (3, 8)
+        for camera in rig
+    ]
+    write_images(tmp_path, images)
+    write_middlebury(tmp_path / "rig_par.txt", opencv(images))
+    capture = open_capture(tmp_path)
+    assert len(capture.cameras) == 4 and capture.frame_ids == ("0003", "0008") and capture.has_masks
+    for camera in rig:
+        (center,) = capture.cameras.select([camera["name"]]).centers
+        torch.testing.assert_close(
+            center.double(), -torch.tensor(camera["R"].T @ camera["t"]), atol=1e-5, rtol=1e-5
+        )
+
+
 def test_footage_next_to_incomplete_files_of_opencv_is_named(tmp_path, caplog):
     rig = rig_of(4)
     write_opencv(tmp_path, opencv(rig))
@@ -133,6 +151,15 @@ def test_chapters_next_to_a_thumbnail_are_named(tmp_path):
             write_film(tmp_path / f"videos/{camera['name']}/GX0{chapter}0042.MP4", [picture(chapter)])
         Image.new("RGB", (64, 48)).save(tmp_path / f"videos/{camera['name']}/GX010042.jpg")
     with pytest.raises(CaptureError, match=r"expected one video of camera .*GX010042.*GX020042"):
+        open_capture(tmp_path)
+
+
+def test_footage_one_folder_deeper_is_named(tmp_path):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    for camera in rig:
+        write_film(tmp_path / f"videos/{camera['name']}/100GOPRO/GX010042.MP4", [picture(0)])
+    with pytest.raises(CaptureError, match=r"got some in videos/\w+/100GOPRO alone; move them up"):
         open_capture(tmp_path)
 
 

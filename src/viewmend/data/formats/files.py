@@ -389,7 +389,7 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         if video is not None:
             entries[name] = {"width": video.width, "height": video.height, "video": path}
         elif (images := list_images(folder, path)) is None:
-            raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
+            raise ValueError(_without_images(folder, name, path))
         else:
             first = images.pattern.replace("{frame}", min(images.frames, key=frame_order))
             width, height = image_size_px(folder, first)
@@ -412,6 +412,18 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
     clock = match_tracks(tracks)
     return Footage(tuple(f"{time:06d}" for time in range(clock.end)), clock.fps, entries)
+
+
+def _without_images(folder: Path, name: str, path: str) -> str:
+    """The error of a camera whose folder holds no footage; names a folder in it that does."""
+    inner = [place for place in sorted((folder / path).rglob("*")) if place.is_dir()]
+    places = [place.relative_to(folder).as_posix() for place in inner]
+    within = next((place for place in places if _has_footage(folder, place)), None)
+    if within is None:
+        return f"expected images of camera '{name}' in {path}, got none; add them"
+    return (
+        f"expected images or a video of camera '{name}' in {path}, got some in {within} alone; move them up"
+    )
 
 
 def _count_images(folder: Path, place: str) -> int:

@@ -1,7 +1,13 @@
-"""Middlebury's multi-view data sets (`*_par.txt`). Each image is a camera of a single frame."""
+"""Middlebury's multi-view data sets (`*_par.txt`).
+
+Each image is a camera of a single frame, unless poses and names show that a fixed rig was recorded
+at several times.
+"""
 
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from viewmend.data.formats.files import (
     decode_text,
@@ -12,6 +18,7 @@ from viewmend.data.formats.files import (
     names_from_paths,
     warn_of_unused_images,
 )
+from viewmend.data.formats.moments import PosedImage, fixed_cameras
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**22
@@ -35,13 +42,24 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         )
         expected = f"a count, then that many lines of a name and {NUMBERS} numbers"
         raise ValueError(f"expected {expected}, got {got}; copy it again")
+    posed = [_posed(folder, words[0], [float(word) for word in words[1:]]) for words in lines[1:]]
+    warn_of_unused_images(folder, [image.path for image in posed])
+    rig = fixed_cameras(posed)
+    if rig is not None:
+        cameras, frames = rig
+        return {"frames": list(frames), "cameras": cameras}
     entries = []
-    for words, name in zip(lines[1:], names_from_paths([words[0] for words in lines[1:]]), strict=True):
-        numbers = [float(word) for word in words[1:]]
-        rows = [numbers[start : start + 3] for start in range(0, NUMBERS, 3)]
-        place = "" if (folder / words[0]).is_file() else "images/"
-        width, height = image_size_px(folder, place + words[0])
-        entry = {"name": name, "width": width, "height": height, "K": rows[:3], "R": rows[3:6], "t": rows[6]}
-        entries.append(entry | {"image": place + words[0], "mask": find_mask(folder, words[0])})
-    warn_of_unused_images(folder, [entry["image"] for entry in entries])
+    for image, name in zip(posed, names_from_paths([words[0] for words in lines[1:]]), strict=True):
+        pose = {"R": image.R.tolist(), "t": (-image.R @ image.center).tolist()}
+        entries.append({"name": name, **image.lens, **pose, "image": image.path, "mask": image.mask})
     return {"frames": ["0"], "cameras": entries}
+
+
+def _posed(folder: Path, name: str, numbers: list[float]) -> PosedImage:
+    """An image with its lens and pose, from the numbers of its line: K, R and t."""
+    place = "" if (folder / name).is_file() else "images/"
+    width, height = image_size_px(folder, place + name)
+    K, R = np.array(numbers[:18]).reshape(2, 3, 3)
+    t = np.array(numbers[18:])
+    lens = {"width": width, "height": height, "K": K.tolist()}
+    return PosedImage(place + name, find_mask(folder, name), lens, R, -np.linalg.solve(R, t))
