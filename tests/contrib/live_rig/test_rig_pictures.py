@@ -18,7 +18,7 @@ from viewmend.contrib.live_rig.frame_readers import DamageFilter, Playback, read
 from viewmend.contrib.live_rig.frame_times import ArrivalTimes, DriverTimes, SenderTimes
 from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.sender_clock import SenderClock
-from viewmend.data.video_clock import Track
+from viewmend.data.video_clock import Timecode, Track
 from viewmend.data.videos import to_rgb
 
 FPS = 10
@@ -90,6 +90,16 @@ def test_recordings_keep_the_times_at_which_they_started():
     assert playback.shifts_s == {"a": pytest.approx(-5.0), "b": pytest.approx(-5.0)}
     playback.follow([track("a", 5.0, 10), track("b", 5.0, 9), track("c", 100.0, 10)])  # no common time
     assert playback.length_s == pytest.approx(0.9) and playback.shifts_s["c"] == pytest.approx(-100.0)
+
+
+def test_recordings_are_played_by_their_timecodes_and_this_is_said():
+    def track(name, clock_frames):
+        return Track(name, "images", np.arange(10) / 10, 10.0, timecode=Timecode(clock_frames, 10))
+
+    playback = Playback()
+    said = playback.follow([track("a", 36_000), track("b", 36_003)])
+    assert playback.shifts_s == {"a": pytest.approx(0.0), "b": pytest.approx(0.3)}
+    assert said is not None and "0.30 s apart (first 'a', last 'b'); they are matched by timecode" in said
 
 
 def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):

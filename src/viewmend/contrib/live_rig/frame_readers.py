@@ -60,13 +60,14 @@ class Playback:
         """Seconds to add to the times in a camera's recording. The first image of all of them is then
         at 0. A recording that is not listed is played alone, from its first image."""
 
-    def follow(self, tracks: Sequence[Track]) -> None:
-        """Play these recordings by their own times.
+    def follow(self, tracks: Sequence[Track]) -> str | None:
+        """Play these recordings by their own times. Returns what their timecodes say of their starts, if these differ.
 
         Raises:
             ValueError: no two of them show the same time.
         """
-        matched = match_tracks(tracks).tracks
+        clock = match_tracks(tracks)
+        matched = clock.tracks
         first_s = min(float(track.times_s[0]) for track in matched)
         ends_s = [float(track.times_s[-1]) + 1 / (track.fps or 1.0) for track in matched]
         self.length_s = min(ends_s) - first_s
@@ -74,6 +75,7 @@ class Playback:
             track.camera: float(moved.times_s[0] - track.times_s[0]) - first_s
             for track, moved in zip(tracks, matched, strict=True)
         }
+        return clock.timecodes
 
     def lap_start_s(self, now_s: float) -> float:
         """When the current lap began."""

@@ -139,9 +139,11 @@ class RigFileSource(LiveSource):
         # Recordings are played on one time line.
         recordings = [camera for camera in rig.cameras if camera.is_file]
         if recordings:
-            self._playback.follow(
+            found = self._playback.follow(
                 [video_track(camera.name, "images", Path(camera.url)) for camera in recordings]
             )
+            if found is not None:
+                log.warning("%s", found)
 
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
