@@ -22,6 +22,7 @@ from viewmend.data.capture_folder import open_capture
 from viewmend.data.checks.leave_one_out import find_cut_off_subject, find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
+from viewmend.data.images import exif_orientation, orientation_of, tiff_orientation
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import reconstruct
@@ -304,6 +305,26 @@ def test_masks_that_follow_exif_are_turned_back(lying, orientation):
     for path in sorted(lying.glob("mask/*/*.png")) if orientation > 1 else ():
         Image.open(path).transpose(undone[orientation]).save(path)
     assert (open_capture(lying).read(0).mask == expected).all()
+
+
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+def test_tiff_images_are_used_as_stored(lying, orientation):
+    expected = open_capture(lying).read(0)
+    for path in sorted(lying.glob("image/*/*.jpg")):
+        tag = {274: orientation}
+        Image.open(path).save(path.with_suffix(".tif"), tiffinfo=tag)
+    text = (lying / "cameras.json").read_text()
+    (lying / "cameras.json").write_text(text.replace(".jpg", ".tif"))
+    found = open_capture(lying).read(0)
+    assert (found.rgb == expected.rgb).all() and (found.mask == expected.mask).all()
+    orientations = {exif_orientation(path) for path in lying.glob("image/*/*.tif")}
+    assert orientations == {orientation_of(orientation)}
+
+
+@pytest.mark.parametrize("end", [4, 9, 20])
+def test_a_truncated_tiff_has_no_orientation(end):
+    data = b"II*\0" + (8).to_bytes(4, "little") + (1).to_bytes(2, "little") + bytes(12)
+    assert tiff_orientation(data[:end]) is None
 
 
 def test_masks_with_exif_of_their_own_are_turned(lying):

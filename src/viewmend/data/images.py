@@ -56,6 +56,12 @@ EXIF_ORIENTATIONS = (
     (True, True, False),
 )
 """The fields of `Orientation` for the values 2 to 8 of EXIF's orientation tag; 1 is upright."""
+TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+"""The byte order of a TIFF file, as `struct` names it, by its first four bytes."""
+TIFF_ENTRY_BYTES = 12
+"""Length of an entry of a TIFF directory."""
+ORIENTATION_TAG = 274
+"""The tag of the orientation in EXIF and TIFF."""
 RUN_LENGTH_SUFFIX = ".bin"
 """Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then
 the end of each run."""
@@ -104,10 +110,38 @@ class Orientation:
         return np.ascontiguousarray(stored.swapaxes(0, 1) if self.transposed else stored)
 
 
+def orientation_of(value: int) -> Orientation | None:
+    """The orientation that a value of EXIF's tag means; None for 1, which is upright, and for invalid values."""
+    if not 2 <= value < 2 + len(EXIF_ORIENTATIONS):
+        return None
+    transposed, flip_rows, flip_columns = EXIF_ORIENTATIONS[value - 2]
+    return Orientation(transposed, flip_rows, flip_columns)
+
+
+def tiff_orientation(data: bytes) -> Orientation | None:
+    """How a TIFF file's first directory asks viewers to turn the image; None if it does not, or for other data."""
+    order = TIFF_ORDERS.get(data[:4])
+    if order is None:
+        return None
+    try:
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, at)
+        for entry in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHIH", data, at + 2 + TIFF_ENTRY_BYTES * entry)
+            if tag == ORIENTATION_TAG:
+                return orientation_of(value)
+    except struct.error:  # truncated
+        return None
+    return None
+
+
 def exif_orientation(path: Path) -> Orientation | None:
-    """How EXIF asks viewers to turn the image; None if it does not, or if this is not an image."""
+    """How EXIF, or TIFF, asks viewers to turn the image; None if it does not, or if this is not an image."""
+    content = read_bytes(path)
+    if content[:4] in TIFF_ORDERS:
+        return tiff_orientation(content)
     small = cv2.IMREAD_REDUCED_COLOR_4
-    data = np.frombuffer(read_bytes(path), np.uint8)
+    data = np.frombuffer(content, np.uint8)
     stored = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION)
     turned = cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
@@ -315,14 +349,17 @@ def decode_image(data: bytes, flags: int) -> np.ndarray | None:
     """Decode untrusted image data with these OpenCV flags; None if it is not an image, truncated or too large.
 
     The size in the header and the lengths of PNG chunks are checked before any memory is allocated for them.
+    TIFF images, which OpenCV always turns as they say, come as stored.
     """
     width, height = size_from_header(data) or (0, 0)
     if not data or width * height > MAX_PIXELS or not _is_complete(data):
         return None
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # the header claims more pixels than OpenCV accepts
         return None
+    orientation = tiff_orientation(data)
+    return image if orientation is None or image is None else orientation.undo(image)
 
 
 def _is_complete(data: bytes) -> bool:

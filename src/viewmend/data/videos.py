@@ -97,6 +97,9 @@ CHECKED_FRAMES = 8
 """The times of this many frames at the start are compared with those of their packets."""
 SEEK_FRAMES = 8
 """Fewer frames than this are decoded rather than skipped by seeking."""
+FIRST_FIELDS = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}
+"""The field that is shown first, by FFmpeg's code of a stream's field order. Frames of some H.264 films contradict it,
+because their decoder takes the bottom field as the first where the stream does not say."""
 RATE_TOLERANCE = 0.01
 NO_CHROMA_FILTER = "POINT"
 """Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths
@@ -136,6 +139,9 @@ class VideoProperties:
     is_interlaced: bool = False
     """Whether frames are made of two fields. They are read de-interlaced, at the time of their
     first field."""
+    first_field: str = "auto"
+    """Which field of an interlaced film is shown first, as FFmpeg's filters name it: "tff" for the top one, "bff" for
+    the bottom one, "auto" as each frame says."""
     timecode: str | None = None
     """The recorder's clock at the first frame, HH:MM:SS:FF, or HH:MM:SS;FF in drop-frame counting."""
 
@@ -162,6 +168,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
         packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
         may_be_delayed = stream.frames == 0 and codec.has_b_frames
+        first_field = FIRST_FIELDS.get(int(codec.field_order), "auto")
         names = set(container.format.name.split(","))
         timecode = _timecode(container, stream)
     head = list(islice(_decoded(path), CHECKED_FRAMES))
@@ -194,6 +201,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         keys,
         is_timed=not names & WITHOUT_TIMES,
         is_interlaced=2 * sum(frame.interlaced_frame for frame in head) > len(head),
+        first_field=first_field,
         timecode=timecode,
     )
 
@@ -304,10 +312,10 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
 def _progressive(video: VideoProperties, seek: int | None, threads: int) -> "Iterator[VideoFrame]":
     """The decoded frames, de-interlaced if the film is interlaced."""
     frames = _decoded(video.path, seek, threads)
-    return _deinterlaced(frames) if video.is_interlaced else frames
+    return _deinterlaced(frames, video.first_field) if video.is_interlaced else frames
 
 
-def _deinterlaced(frames: "Iterator[VideoFrame]") -> "Iterator[VideoFrame]":
+def _deinterlaced(frames: "Iterator[VideoFrame]", first_field: str) -> "Iterator[VideoFrame]":
     """Each frame's first field, with the other field's rows interpolated by FFmpeg's bwdif."""
     from av import BlockingIOError, FFmpegError
     from av.filter import Graph
@@ -318,9 +326,8 @@ def _deinterlaced(frames: "Iterator[VideoFrame]") -> "Iterator[VideoFrame]":
     graph = Graph()
     base = first.time_base or Fraction(1, 25)
     source = graph.add_buffer(width=first.width, height=first.height, format=first.format, time_base=base)
-    graph.link_nodes(
-        source, graph.add("bwdif", "mode=send_frame:parity=auto:deint=all"), graph.add("buffersink")
-    )
+    options = f"mode=send_frame:parity={first_field}:deint=all"
+    graph.link_nodes(source, graph.add("bwdif", options), graph.add("buffersink"))
     graph.configure()
     for frame in chain([first], frames, [None]):
         graph.push(frame)
