@@ -190,7 +190,6 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
     if not names & ABSOLUTE_TIMES or ("mp4" in names and delayed):
         seconds -= seconds[0]
     height, width = _upright(np.empty((head[0].height, head[0].width), np.uint8), head[0]).shape
-    keys = tuple(sorted(time for time, key in packets if key and time is not None)) if timestamps else ()
     return VideoProperties(
         path,
         width,
@@ -198,7 +197,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         fps,
         tuple(seconds.tolist()),
         timestamps,
-        keys,
+        tuple(sorted(time for time, key in packets if key and time is not None)) if timestamps else (),
         is_timed=not names & WITHOUT_TIMES,
         is_interlaced=2 * sum(frame.interlaced_frame for frame in head) > len(head),
         first_field=first_field,
