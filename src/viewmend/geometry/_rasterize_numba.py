@@ -31,16 +31,44 @@ def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, tr
         a = projected[faces[f, 0]]
         b = projected[faces[f, 1]]
         c = projected[faces[f, 2]]
-        box = pixel_box(a, b, c, near, (0, width), (first_row, end_row))
-        if box[0] < box[1] and box[2] < box[3]:
-            draw_face(a, b, c, f, near, cull, box, depth, triangle)
+        left, right, top, bottom = pixel_box(a, b, c, near, (0, width), (first_row, end_row))
+        if left >= right or top >= bottom:
+            continue
+        ax = b[1] * c[2] - b[2] * c[1]
+        ay = b[2] * c[0] - b[0] * c[2]
+        aw = b[0] * c[1] - b[1] * c[0]
+        determinant = a[0] * ax + a[1] * ay + a[2] * aw
+        if determinant == 0 or determinant * cull > 0:
+            continue
+        bx = c[1] * a[2] - c[2] * a[1]
+        by = c[2] * a[0] - c[0] * a[2]
+        bw = c[0] * a[1] - c[1] * a[0]
+        cx = a[1] * b[2] - a[2] * b[1]
+        cy = a[2] * b[0] - a[0] * b[2]
+        cw = a[0] * b[1] - a[1] * b[0]
+        sign = 1.0 if determinant > 0 else -1.0
+        for row in range(top, bottom):
+            v = row + 0.5
+            a0 = ay * v + aw
+            b0 = by * v + bw
+            c0 = cy * v + cw
+            for column in range(left, right):
+                u = column + 0.5
+                ea = ax * u + a0
+                eb = bx * u + b0
+                ec = cx * u + c0
+                if ea * sign >= 0 and eb * sign >= 0 and ec * sign >= 0:
+                    inverse = np.float32((ea + eb + ec) / determinant)
+                    if inverse * near < 1 and inverse > depth[row, column]:
+                        depth[row, column] = inverse
+                        triangle[row, column] = f
     for row in range(first_row, end_row):
         for column in range(width):
             if triangle[row, column] >= 0:
                 depth[row, column] = np.float32(1) / depth[row, column]
 
 
-@kernel
+@kernel(inline="always")
 def pixel_box(a, b, c, near, columns, rows):
     """First and end column, first and end row of the pixels whose centres may be in a triangle.
 
@@ -61,39 +89,6 @@ def pixel_box(a, b, c, near, columns, rows):
         max(rows[0], top),
         min(rows[1], bottom + 1),
     )
-
-
-@kernel
-def draw_face(a, b, c, face, near, cull, box, depth, triangle):
-    """Draw one face into the pixels of a box; `depth` gets 1 / z."""
-    at_a = edge(b, c)
-    at_b = edge(c, a)
-    at_c = edge(a, b)
-    determinant = a[0] * at_a[0] + a[1] * at_a[1] + a[2] * at_a[2]
-    if determinant == 0 or determinant * cull > 0:
-        return
-    sign = 1.0 if determinant > 0 else -1.0
-    for row in range(box[2], box[3]):
-        v = row + 0.5
-        a_row = at_a[1] * v + at_a[2]
-        b_row = at_b[1] * v + at_b[2]
-        c_row = at_c[1] * v + at_c[2]
-        for column in range(box[0], box[1]):
-            u = column + 0.5
-            a_value = at_a[0] * u + a_row
-            b_value = at_b[0] * u + b_row
-            c_value = at_c[0] * u + c_row
-            if a_value * sign >= 0 and b_value * sign >= 0 and c_value * sign >= 0:
-                inverse = np.float32((a_value + b_value + c_value) / determinant)
-                if inverse * near < 1 and inverse > depth[row, column]:
-                    depth[row, column] = inverse
-                    triangle[row, column] = face
-
-
-@kernel(inline="always")
-def edge(p, q):
-    """The edge between two projected corners as the plane p x q over (u, v, 1)."""
-    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
 @kernel
