@@ -25,6 +25,9 @@ let completed = MODES.completed;
 /** Of what is shown on one side of the divider. @param {string} value */
 const nameOf = (value) =>
   ({ ...MODES, completed, original: "Original", error: "Error map", compared: completedBy(value.slice("compared:".length)) })[modeOf(value)] ?? value;
+/** The same in a narrow list: without the server's model, or the other model alone. @param {string} value */
+const shortNameOf = (value) =>
+  value === "completed" ? MODES.completed : modeOf(value) === "compared" ? value.slice("compared:".length) : nameOf(value);
 
 /** What can be compared, once the server said which models it has. @param {Settings} settings @param {string} own model's name @param {string[]} models the others */
 export function offerModels(settings, own, models) {
@@ -33,10 +36,10 @@ export function offerModels(settings, own, models) {
   for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
     const list = byId(`split-${side}`);
     for (const option of [...list.options]) if (!(option.value in MODES)) option.remove();
-    list.append(...others.map((value) => element("option", { value, textContent: nameOf(value) })));
+    list.append(...others.map((value) => element("option", { value, textContent: shortNameOf(value) })));
     if (![...list.options].some(({ value }) => value === settings.get(side))) settings.set(side, "completed");
     list.value = settings.get(side);
-    for (const option of list.options) option.textContent = nameOf(option.value);
+    for (const option of list.options) option.textContent = shortNameOf(option.value);
     byId(`${side}-name`).textContent = nameOf(settings.get(side));
   }
 }
