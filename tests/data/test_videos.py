@@ -1,5 +1,6 @@
 """Films: every frame once, upright, at its time, whatever the container claims."""
 
+import gc
 import multiprocessing
 import os
 import threading
@@ -165,6 +166,7 @@ def test_a_forked_process_needs_no_thread_of_its_parent(tmp_path, monkeypatch):
     reading = threading.Thread(target=film.read, args=(0, "here"))
     reading.start()
     is_reading.wait()
+    gc.collect()  # decoders of earlier tests, which the child would wait for if it collected them
     fork = multiprocessing.get_context("fork")
     receiver, sender = fork.Pipe(duplex=False)
     child = fork.Process(target=lambda: sender.send_bytes(film.read(1, "here").tobytes()))
