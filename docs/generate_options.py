@@ -61,8 +61,8 @@ def page() -> str:
 
     parts = ["# Command-line options", "Generated from the help of each command."]
     for command in COMMANDS:
-        words = command.name.split()
-        parts += [section(*words, *recipe.split()) for recipe in WITH_RECIPES.get(command.name, ("",))]
+        words = command.split()
+        parts += [section(*words, *recipe.split()) for recipe in WITH_RECIPES.get(command, ("",))]
     return "\n\n".join(parts) + "\n"
 
 
