@@ -11,7 +11,7 @@ from viewmend.live.client import Client
 from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.protocol import unpack
 from viewmend.live.renderer import Renderer, RenderRequest
-from viewmend.mending import Mender
+from viewmend.mending import Mender, default_protocol
 from viewmend.models.base import RenderQuality
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.smooth_fill import SmoothFill
@@ -32,8 +32,8 @@ class Ball(FrameSource):
         return self.frame
 
 
-def prepared(inpainter, without=()) -> Renderer:
-    renderer = Renderer(Ball(without), inpainter, PIPELINE)
+def prepared(inpainter, without=(), error_model=None) -> Renderer:
+    renderer = Renderer(Ball(without), inpainter, PIPELINE, error_model=error_model)
     assert renderer.prepare(0)
     return renderer
 
@@ -65,7 +65,7 @@ def test_another_model_completes_the_same_view(views, without):
     result = rendered(
         prepared(views), model="paper-small", without=without, extra_modes=frozenset({"compared"})
     )
-    (alone,) = rendered(prepared(load_inpainter("paper-small"), without)).completed
+    (alone,) = rendered(prepared(load_inpainter("paper-small"), without, views)).completed
     ((own, extra),) = result.eyes
     assert (extra["compared"][:3] - alone.rgb).abs().max() < 1e-4
     assert (extra["compared"][:3] - own.rgb).abs().max() > 0.02
@@ -74,7 +74,8 @@ def test_another_model_completes_the_same_view(views, without):
 @pytest.mark.parametrize("model", [None, "paper-small"])
 def test_scores_are_those_of_mend(views, model):
     frame = Ball().frame
-    mender = Mender(load_inpainter(model) if model else views, PIPELINE)
+    inpainter = load_inpainter(model) if model else views
+    mender = Mender(inpainter, PIPELINE, error_model=views, protocol=default_protocol(inpainter))
     truth = frame.select([LEFT_OUT])
     step = mender.mend(frame.without([LEFT_OUT]), truth.cameras, truth)
     result = rendered(prepared(views), truth=LEFT_OUT, without=(LEFT_OUT,), model=model)
