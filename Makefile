@@ -28,7 +28,7 @@ tests: kernels
 	$(UNCHECKED)
 
 slow: kernels ## tests over ten seconds, and those in a browser
-	$(UNCHECKED) -m slow
+	$(UNCHECKED) -m slow $(OPTIONS)
 
 shapes: kernels
 	$(BIN)/pytest $(CHECKED)
