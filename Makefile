@@ -25,7 +25,7 @@ test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays
 	$(PYTEST) -m ""
 
 tests: kernels
-	$(UNCHECKED)
+	$(UNCHECKED) $(OPTIONS)
 
 slow: kernels ## tests over ten seconds, and those in a browser
 	$(UNCHECKED) -m slow $(OPTIONS)
