@@ -543,5 +543,5 @@ class Stream:
 
 
 def _allows_mask(quality: RenderQuality) -> bool:
-    """Whether a view of this quality may cost the prediction of its mask, which takes as long as a view by `views`."""
+    """Whether the quality allows the prediction of a mask, which takes as long as a view by `views`."""
     return quality.mend and quality.context_times is None

@@ -202,8 +202,7 @@ class _MethodStream:
         inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
         error_model = error_model_for(inpainter, settings.device) if predicted else None
-        # The geometry comes with the frames, which all methods share.
-        # So does a mask, where it is known or predicted.
+        # Geometry and mask come with the frames, which all methods share.
         config = replace(settings.stream, geometry="hull", background=settings.background, predict_mask=False)
         quality = RenderQuality(top_k=settings.top_k)
         sequence = ViewSequence(inpainter, config, bounds, quality=quality, error_model=error_model)

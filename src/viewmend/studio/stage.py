@@ -144,7 +144,10 @@ class Studio:
         return replace(frame, cameras=self.cameras.select(names))
 
     def backdrop(self, names: Sequence[str] | None = None) -> Float[Tensor, "view 3 height width"] | None:
-        """The stage behind the subject in the images of these cameras, or of all: linear light; None for black."""
+        """The stage behind the subject in the images of these cameras, by default all, in linear light.
+
+        None if the background is black.
+        """
         if self.config.background != "stage":
             return None
         names = self.cameras.names if names is None else names

@@ -43,7 +43,7 @@ class SceneConfig:
     """Whether a quarter of each studio rig's cameras are held out together, and share the hull of
     the others."""
     few_cameras_fraction: Annotated[float, HIDDEN] = 0.0
-    """Fraction of the rigs with a shared hull that have few cameras and give no mask of the held-out view."""
+    """Fraction of the rigs with a shared hull that have few cameras, and whose samples have no M_t."""
     num_holdout_views: int = 4
     """Cameras of a scene that are held out, one after the other, to serve as ground truth."""
     imperfect_fraction: float = 0.6
