@@ -11,7 +11,7 @@ from viewmend.models.classical import Unfilled
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.stage import Studio
 from viewmend.training.config import SamplingConfig, SceneConfig
-from viewmend.training.loop import seen_minus_unseen
+from viewmend.training.loop import memorised_gain
 from viewmend.training.scenes import random_studio
 from viewmend.training.shared_rigs import SharedRigScenes, WrongMasks, _SharedRig
 from viewmend.types import MultiViewFrame, Silhouettes
@@ -107,7 +107,7 @@ def test_wrong_masks_are_larger_or_smaller():
     assert torch.equal(WrongMasks(0.0).apply(mask, Random(0)), mask)
 
 
-def test_seen_views_are_compared_with_unseen_ones_by_their_gain():
-    first = {"holes": 10.0, "holes_seen": 12.0}
-    assert seen_minus_unseen({"holes": 11.0, "holes_seen": 13.5}, first) == 0.5
-    assert seen_minus_unseen({"holes": 11.0, "holes_seen": None}, first) is None
+def test_gains_on_seen_views_are_compared_with_those_on_new_views_of_the_same_people():
+    first = {"holes": 9.0, "holes_alike": 10.0, "holes_seen": 12.0}
+    assert memorised_gain({"holes": 9.0, "holes_alike": 11.0, "holes_seen": 13.5}, first) == 0.5
+    assert memorised_gain({"holes": 11.0, "holes_alike": 11.0, "holes_seen": None}, first) is None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from viewmend.training.run_files import Progress
 
 OVERFIT_DB = 0.2
-"""Gain on seen views over that on unseen ones, in dB, from which a run is said to memorise its samples."""
+"""Extra gain on the views of the training, in dB, from which a run is said to memorise its samples."""
 DEFAULT = "views"
 """The recipe if none is named."""
 
@@ -164,15 +164,19 @@ def _line(progress: "Progress") -> str:
 
 
 def validation_text(scores: "Mapping[str, float | None]") -> str:
-    """The latest scores on unseen and seen views, with a warning if the run overfits; "" without a validation."""
+    """The latest scores, with a warning if the run overfits; "" without a validation."""
     unseen = scores.get("holes")
     seen = scores.get("holes_seen")
+    alike = scores.get("holes_alike")
     overfit = scores.get("overfit")
     if unseen is None:
         return ""
-    if seen is None:
+    if seen is None or alike is None:
         return f"; validation {unseen:.2f} dB"
-    text = f"; validation {unseen:.2f} dB on unseen views, {seen:.2f} on seen ones"
+    text = (
+        f"; validation {unseen:.2f} dB on new people, {alike:.2f} on new views of the training's people, "
+        f"{seen:.2f} on the training's views"
+    )
     if overfit is not None and overfit > OVERFIT_DB:
-        text += f" (seen views gained {overfit:.2f} dB more: the run memorises its samples)"
+        text += f" (these gained {overfit:.2f} dB more than new views: the run memorises its samples)"
     return text

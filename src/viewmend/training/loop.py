@@ -321,7 +321,7 @@ class Run:
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
         if "holes_seen" in scores:
-            scores |= {"overfit": seen_minus_unseen(scores, first)}
+            scores |= {"overfit": memorised_gain(scores, first)}
         log.add_validation(step, scores)
         self.validated = scores
         score = scores.get("score")
@@ -450,13 +450,13 @@ class Run:
         )
 
 
-def seen_minus_unseen(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:
-    """The model's gain on seen views minus its gain on unseen views, dB; None if a score is missing.
+def memorised_gain(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:
+    """The gain on views that the run trained on, minus that on new views of the same people, dB.
 
-    Gains are relative to the scores of the first validation.
+    Gains are relative to the scores of the first validation. None if a score is missing.
     """
     gains = []
-    for name in ("holes_seen", "holes"):
+    for name in ("holes_seen", "holes_alike"):
         now = scores.get(name)
         before = first.get(name)
         if now is None or before is None:

@@ -1,7 +1,7 @@
 """What a run trains: a model with its loss, data, optimiser and validation. The loop is in `viewmend.training.loop`."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
 from pathlib import Path
@@ -76,8 +76,8 @@ class Objective(nn.Module, Generic[Model]):
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
     compares_seen = False
-    """Whether the validation also scores views that the run trains on, beginning with the weights
-    it starts from."""
+    """Whether the validation also scores views that the run trains on, and new views of the same
+    people, beginning with the weights it starts from."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()
@@ -194,9 +194,8 @@ def write_rows(rows: Images, path: Path) -> None:
 class HoleValidation:
     """PSNR in the holes of fixed views, of the model ("holes") and of OpenCV's Telea ("telea").
 
-    With `seen`, the scenes that the run trains on, as many views of these are scored as well
-    ("holes_seen" and "telea_seen"): a model that memorises its samples gains more on them. The
-    views are made at the first validation.
+    Each of the `others` gets scores of its own, from as many views: "seen" has "holes_seen" and
+    "telea_seen". The views are made at the first validation.
     """
 
     scenes: SceneSource[Sample]
@@ -204,13 +203,14 @@ class HoleValidation:
     complete: Callable[[nn.Module, Sample], Float[Tensor, "3 _h _w"]]
     """The model's completed view of a sample, on `background`."""
     background: Background
-    seen: SceneSource[Sample] | None = None
+    others: Mapping[str, SceneSource[Sample]] = field(default_factory=dict)
+    """Further scenes, by the suffix of their scores."""
     _samples: dict[str, list[Sample]] = field(default_factory=dict)
 
     @torch.no_grad()
     def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
         """Score a model."""
-        sources = {"": self.scenes} if self.seen is None else {"": self.scenes, "_seen": self.seen}
+        sources = {"": self.scenes} | {f"_{name}": scenes for name, scenes in self.others.items()}
         training = model.training
         model.eval()
         scores: dict[str, float | None] = {}

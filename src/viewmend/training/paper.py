@@ -57,10 +57,15 @@ class PaperObjective(Objective[PatchTransformer]):
             config.validation_views,
             _complete,
             options.model.background,
-            self.training_scenes(f"{config.seed}/0"),
+            {"seen": self.training_scenes(f"{config.seed}/0"), "alike": self._scenes_alike()},
         )
         if not options.train_encoder:
             self.model.tokeniser.requires_grad_(False)
+
+    def _scenes_alike(self) -> SceneSource[Sample]:
+        """New scenes of the people that the run trains on."""
+        options = self.config.objective
+        return options.make_scenes(self.config.scenes, f"{self.config.seed}/alike")
 
     def forward(self, batch: Sequence[Sample]) -> StepOutput:
         """All terms of a batch of samples of any sizes."""
