@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -47,7 +47,7 @@ from viewmend.models.registry import make_method
 from viewmend.scenes.capture_scenes import capture_set
 from viewmend.scenes.held_out import LeaveOneOutFrame
 from viewmend.scenes.studio_scenes import procedural_set
-from viewmend.stream import Stream, StreamConfig
+from viewmend.stream import Geometry, Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -160,6 +160,9 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8, help="number of views per set, evenly spaced")
     parser.add_argument("--size", type=int, default=320, help="width and height of the views of P and turn")
     parser.add_argument(
+        "--geometry", choices=get_args(Geometry), default="hull", help="the mesh that is drawn"
+    )
+    parser.add_argument(
         "--paints", type=int, default=10, help="a view is painted this many times to be timed"
     )
     parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each method")
@@ -173,7 +176,7 @@ def main() -> None:
         for name in options.sets:
             scores = SetScores()
             for number, frame in enumerate(poses(name, options.views, options.size)):
-                pictures = draw(frame, host, page, scores, options.paints)
+                pictures = draw(frame, host, page, scores, options.paints, options.geometry)
                 truth = true_view(frame.truth, "black")
                 judge(pictures, truth, metrics, scores)
                 if options.sheets:
@@ -181,7 +184,7 @@ def main() -> None:
                 print(f"  {number}: {method_lpips(scores)}", flush=True)
             results[name] = report(name, scores)
             if options.write:  # after every set, so that nothing is lost if a later one fails
-                config = {key: getattr(options, key) for key in ("sets", "views", "size")}
+                config = {key: getattr(options, key) for key in ("sets", "views", "size", "geometry")}
                 print(write("drawn_views", "cpu", config, results), flush=True)
 
 
@@ -213,13 +216,14 @@ def turn(count: int, size_px: int) -> Iterator[LeaveOneOutFrame]:
 
 
 def draw(
-    frame: LeaveOneOutFrame, host: Host, page: Any, scores: SetScores, paints: int
+    frame: LeaveOneOutFrame, host: Host, page: Any, scores: SetScores, paints: int, geometry: Geometry
 ) -> dict[str, Float[Tensor, "3 height width"]]:
     """The left-out camera's view by the model, and as the page draws it, `paints` times to be timed."""
-    stream = Stream(make_method("views"), StreamConfig(memory_mb=None), frame.bounds)
+    config = StreamConfig(geometry=geometry, memory_mb=None)
+    stream = Stream(make_method("views"), config, frame.bounds)
     cached = stream.add_frame(frame.inputs)
     proxy = cached.proxy
-    assert isinstance(proxy, GeometryProxy), "streams compute hulls"
+    assert isinstance(proxy, GeometryProxy), "no other geometry was given"
     target = frame.truth.cameras
     completed = stream.view(target, time=cached.frame.time).completed
     pictures = {"views": composite("black", completed.rgb, completed.opacity).clamp(0, 1)}
