@@ -168,7 +168,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
         packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
         may_be_delayed = stream.frames == 0 and codec.has_b_frames
-        first_field = FIRST_FIELDS.get(int(codec.field_order), "auto")
+        first_field = first_field_of(codec)
         names = set(container.format.name.split(","))
         timecode = _timecode(container, stream)
     head = list(islice(_decoded(path), CHECKED_FRAMES))
@@ -311,11 +311,28 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
 def _progressive(video: VideoProperties, seek: int | None, threads: int) -> "Iterator[VideoFrame]":
     """The decoded frames, de-interlaced if the film is interlaced."""
     frames = _decoded(video.path, seek, threads)
-    return _deinterlaced(frames, video.first_field) if video.is_interlaced else frames
+    if not video.is_interlaced:
+        return frames
+    return _filtered(frames, "bwdif", f"mode=send_frame:parity={video.first_field}:deint=all")
 
 
-def _deinterlaced(frames: "Iterator[VideoFrame]", first_field: str) -> "Iterator[VideoFrame]":
-    """Each frame's first field, with the other field's rows interpolated by FFmpeg's bwdif."""
+def first_field_of(codec: "VideoCodecContext") -> str:
+    """Which field of an interlaced stream is shown first; see `VideoProperties.first_field`."""
+    return FIRST_FIELDS.get(int(codec.field_order), "auto")
+
+
+def first_field_alone(frame: "VideoFrame", first_field: str = "auto") -> "VideoFrame":
+    """A live stream's frame without its second field, whose rows are interpolated; itself if it is not interlaced.
+
+    Recorded films are interpolated from the frames before and after, too. A live picture would be late if it waited.
+    """
+    if not frame.interlaced_frame:
+        return frame
+    return next(_filtered(iter([frame]), "estdif", f"mode=frame:parity={first_field}:deint=all"), frame)
+
+
+def _filtered(frames: "Iterator[VideoFrame]", name: str, options: str) -> "Iterator[VideoFrame]":
+    """The frames after one of FFmpeg's filters, with their own times."""
     from av import BlockingIOError, FFmpegError
     from av.filter import Graph
 
@@ -325,8 +342,7 @@ def _deinterlaced(frames: "Iterator[VideoFrame]", first_field: str) -> "Iterator
     graph = Graph()
     base = first.time_base or Fraction(1, 25)
     source = graph.add_buffer(width=first.width, height=first.height, format=first.format, time_base=base)
-    options = f"mode=send_frame:parity={first_field}:deint=all"
-    graph.link_nodes(source, graph.add("bwdif", options), graph.add("buffersink"))
+    graph.link_nodes(source, graph.add(name, options), graph.add("buffersink"))
     graph.configure()
     for frame in chain([first], frames, [None]):
         graph.push(frame)

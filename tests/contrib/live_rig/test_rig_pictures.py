@@ -187,19 +187,60 @@ def test_what_is_built_on_a_torn_picture_waits_for_a_key_picture():
     assert counts["torn"] == 3
 
 
-def transport_stream(pictures_rgb):
+def transport_stream(pictures_rgb, **options):
     import av
 
     file = BytesIO()
     with av.open(file, "w", format="mpegts") as container:
-        stream = container.add_stream(
-            "libx264", rate=FPS, options={"g": "5", "crf": "10", "tune": "zerolatency"}
-        )
+        given = {"g": "5", "crf": "10", "tune": "zerolatency"} | options
+        stream = container.add_stream("libx264", rate=FPS, options=given)
         stream.height, stream.width, stream.pix_fmt = *pictures_rgb[0].shape[:2], "yuv420p"
         for rgb in pictures_rgb:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
         container.mux(stream.encode())
     return bytearray(file.getvalue())
+
+
+def received_images(camera, stream, counts):
+    """The images that a camera sends over HTTP until its stream ends."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(stream)))
+            self.end_headers()
+            self.wfile.write(bytes(stream))
+
+        def log_message(self, *_):
+            pass
+
+    shown = []
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/"
+        network = replace(camera, url=url, clock="arrival")
+        with (
+            pytest.raises(OSError, match="ended"),
+            closing(read_pictures(network, counts, Playback(), bool)) as received,
+        ):
+            shown.extend(picture.to_rgb() for picture in received)
+    return shown
+
+
+@pytest.mark.parametrize("first_field", ["tff", "bff"])
+def test_an_interlaced_stream_shows_its_first_field(camera, first_field):
+    """Pictures get brighter; the second field of each is half a frame later than the first."""
+    sent = [np.full((96, 96, 3), 40 + 12 * number, np.uint8) for number in range(10)]
+    for image in sent:
+        later = image[1::2] if first_field == "tff" else image[0::2]
+        later += 6
+    stream = transport_stream(sent, **{"x264-params": f"{first_field}=1", "flags": "+ildct+ilme"})
+    shown = received_images(camera, stream, Counter())
+    assert len(shown) >= 8
+    for image in shown:
+        first = float(image.mean())
+        assert abs(first - 40 - 12 * round((first - 40) / 12)) < 2
+        assert abs(float(image[0::2].mean() - image[1::2].mean())) < 2
 
 
 def test_a_damaged_stream_shows_no_damaged_picture(camera):
@@ -212,27 +253,8 @@ def test_a_damaged_stream_shows_no_damaged_picture(camera):
         start = len(stream) * at // 30 // 188 * 188
         del stream[start : start + 188]
         stream[start + 10 : start + 180] = noise.bytes(170)
-    counts, shown = Counter(), []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(stream)))
-            self.end_headers()
-            self.wfile.write(bytes(stream))
-
-        def log_message(self, *_):
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        threading.Thread(target=server.handle_request, daemon=True).start()
-        url = f"http://127.0.0.1:{server.server_port}/"
-        network = replace(camera, url=url, clock="arrival")
-        with (
-            pytest.raises(OSError, match="ended"),
-            closing(read_pictures(network, counts, Playback(), bool)) as received,
-        ):
-            shown.extend(picture.frame.to_ndarray(format="rgb24").astype(float) for picture in received)
+    counts = Counter()
+    shown = [image.astype(float) for image in received_images(camera, stream, counts)]
     assert counts["torn"] >= 2 and 10 <= len(shown) <= 26
     away = [min(np.abs(image - other).mean() for other in sent) for image in shown]
     assert max(away) < 12

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import UInt8
+
 from viewmend.contrib.live_rig.frame_times import frame_times
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.errors import CaptureError
 from viewmend.data.video_clock import Track, match_tracks
-from viewmend.data.videos import decode, video_properties
+from viewmend.data.videos import decode, first_field_alone, first_field_of, to_rgb, video_properties
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -47,6 +50,12 @@ class Picture:
     frame: "VideoFrame"
     taken_s: float
     """When it was taken, on this machine's monotonic clock."""
+    first_field: str = "auto"
+    """Which field is shown first if the frame is interlaced; see `VideoProperties.first_field`."""
+
+    def to_rgb(self, size_px: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
+        """The image, or its first field if it is interlaced, as upright sRGB at its own or another size."""
+        return to_rgb(first_field_alone(self.frame, self.first_field), size_px)
 
 
 class Playback:
@@ -125,7 +134,7 @@ def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Pic
                     continue
                 taken_s = times.taken_s(frame, arrived_s)
                 if taken_s is not None:
-                    yield Picture(frame, taken_s - camera.offset_s)
+                    yield Picture(frame, taken_s - camera.offset_s, first_field_of(stream.codec_context))
 
 
 def _play_recording(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.contrib.live_rig.sender_clock import SenderClock
+from viewmend.data.videos import WITHOUT_TIMES
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -17,7 +18,7 @@ the arrival."""
 LAG_PACKETS = {"rtsp": 1, "rtp": 1, "mpegts": 2}
 """FFmpeg delays images by these numbers of packets: its parsers detect an image's end by the next
 one's start."""
-UNTIMED_FORMATS = ("mjpeg", "mpjpeg", "h264", "hevc", "rawvideo", "image2pipe", "jpeg_pipe")
+UNTIMED_FORMATS = WITHOUT_TIMES | {"mpjpeg", "rawvideo", "image2pipe", "jpeg_pipe"}
 """These formats of FFmpeg have no meaningful timestamps."""
 
 
@@ -82,7 +83,7 @@ class DriverTimes(SenderTimes):
 def frame_times(camera: LiveCamera, container: "InputContainer") -> ArrivalTimes:
     """The times of a camera's images, by its setting `clock` and the stream's format."""
     formats = container.format.name.split(",")
-    if camera.clock == "arrival" or (camera.clock == "auto" and set(formats) & set(UNTIMED_FORMATS)):
+    if camera.clock == "arrival" or (camera.clock == "auto" and set(formats) & UNTIMED_FORMATS):
         return ArrivalTimes()
     if camera.clock == "auto" and "v4l2" in formats:
         return DriverTimes()

@@ -15,7 +15,7 @@ from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
 from viewmend.data.undistortion import Undistortion
-from viewmend.data.videos import is_turned, to_rgb
+from viewmend.data.videos import is_turned
 from viewmend.preprocess.masks.maker import MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
@@ -189,7 +189,7 @@ class CameraWorker:
                 "set the camera's mode in 'options'"
             )
         size_px = camera.width, camera.height
-        rgb = to_rgb(frame, size_px)
+        rgb = picture.to_rgb(size_px)
         mask = cv2.resize(self._masks.mask(reduce_image(rgb, mask_size_px(self.camera))), size_px)
         return self._undistortion.apply(CameraImages(rgb, np.asarray(mask, np.uint8), None))
 
