@@ -272,7 +272,11 @@ INVALID = [
     ("transforms", change_transforms(transform_matrix=(2 * np.eye(3, 4)).tolist()), "R: expected a rotation"),
     ("agisoft False None", replacing('type="frame"', 'type="fisheye"', -1), LENS),
     ("agisoft False None", replacing("<k1>", "<k4>0.1</k4><k1>", -1), LENS),
-    ("agisoft False None", replacing("sensor_id", "lens", -1), LENS),
+    (
+        "agisoft False None",
+        replacing("sensor_id", "lens", -1),
+        "expected a sensor with a calibration, got none",
+    ),
     ("agisoft False None", lambda text: text.replace("<transform>", "<transform>x"), "expected a number"),
     ("agisoft False None", replacing("<cameras>", "<cameras/><others>", -1), "expected XML"),
     ("middlebury", lambda text: text.rpartition(" ")[0], "got 20 after 'cam"),

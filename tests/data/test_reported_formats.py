@@ -226,6 +226,77 @@ def test_photos_of_metashape_that_are_not_used_are_named(tmp_path, caplog, chang
     assert "does not mention are ignored: images/never.png" in caplog.text
 
 
+def edit_agisoft(folder, rig, edit):
+    """Write a rig in Metashape's format, and change its XML."""
+    write_agisoft(folder / "cameras.xml", rig)
+    tree = ET.parse(folder / "cameras.xml")
+    edit(tree.getroot())
+    tree.write(folder / "cameras.xml")
+
+
+def test_photos_of_metashape_without_a_calibrated_sensor_are_named(tmp_path, caplog):
+    rig = rig_of(4)
+    write_images(tmp_path, rig)
+
+    def remove(root, kept):
+        sensors = root.findall(".//sensor")
+        for sensor in sensors[kept:]:
+            for calibration in sensor.findall("calibration"):
+                sensor.remove(calibration)
+
+    edit_agisoft(tmp_path, rig, lambda root: remove(root, 3))
+    assert len(open_capture(tmp_path).cameras) == 3
+    assert f"sensor has no calibration are left out: {rig[3]['name']}" in caplog.text
+    edit_agisoft(tmp_path, rig, lambda root: remove(root, 1))
+    with pytest.raises(
+        CaptureError, match="expected a sensor with a calibration, got none; align the photos"
+    ):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+def test_photos_of_metashape_with_one_name_in_several_folders(tmp_path, grouped):
+    """Metashape's labels are names of files without their folders."""
+    rig = rig_of(3)
+    write_images(tmp_path, rig, "DSC_7")
+    flat = [camera | {"image": "images/DSC_7.png"} for camera in rig]
+
+    def group(root):
+        (cameras,) = root.findall(".//cameras")
+        (old,) = cameras.findall("group")
+        for camera, photo in zip(rig, old.findall("camera[@id]")[1:], strict=False):
+            own = ET.SubElement(cameras, "group", label=camera["name"])
+            old.remove(photo)
+            own.append(photo)
+
+    edit_agisoft(tmp_path, flat, group if grouped else lambda _: None)
+    if grouped:
+        capture = open_capture(tmp_path)
+        names = [name.split("_")[0] for name in capture.cameras.names]
+        assert sorted(names) == sorted(camera["name"] for camera in rig)
+    else:
+        with pytest.raises(
+            CaptureError, match=r"one image of the photo 'DSC_7', got images/.*group of the folder's name"
+        ):
+            open_capture(tmp_path)
+
+
+def test_a_second_chunk_of_metashape_is_named(tmp_path, caplog):
+    rig = rig_of(3)
+    write_images(tmp_path, rig)
+
+    def add(root):
+        (chunk,) = root.findall("chunk")
+        second = ET.fromstring(ET.tostring(chunk))
+        second.set("label", "Take 2")
+        second.find("cameras/group").remove(second.findall(".//camera[@enabled='true']")[0])
+        root.append(second)
+
+    edit_agisoft(tmp_path, rig, add)
+    assert len(open_capture(tmp_path).cameras) == 3
+    assert "the chunk '1' is used, and not Take 2" in caplog.text
+
+
 def several_times(rig, layout, shift=0.0):
     """Each camera of a rig at three times, as images of a reconstruction; positions differ by `shift`."""
     rng = np.random.default_rng(1)

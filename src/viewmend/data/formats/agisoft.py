@@ -2,10 +2,12 @@
 
 Photos without a pose of their own are left out with a warning: those that were not aligned,
 and the secondary cameras of multi-camera systems, whose pose Metashape stores relative to
-the primary camera.
+the primary camera. So are photos whose sensor has no calibration.
 """
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -14,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from viewmend.data.formats.files import (
+    IMAGE_SUFFIXES,
     existing,
     files_like,
     find_mask,
@@ -49,7 +52,7 @@ def _has_chunk(file: Path) -> bool:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The aligned images of the chunk that has most, in the folder or in `images`, in the chunk's unit."""
+    """The aligned images of the chunk that has most, in the folder or below `images`, in the chunk's unit."""
     chunks = read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")
     chunk = max(chunks, key=lambda chunk: len(_used_cameras(chunk)), default=None)
     used = [] if chunk is None else _used_cameras(chunk)
@@ -57,12 +60,17 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         raise ValueError(
             "expected a chunk with aligned cameras, got none; align the photos and export them again"
         )
+    others = [other.get("label", "") for other in chunks if other is not chunk and _used_cameras(other)]
+    if others:
+        warn(f"{file}: the chunk '{chunk.get('label', '')}' is used, and not {listed(others)}")
     _warn_of_others(file, chunk, used)
-    used = existing(folder, used, lambda camera: _find_image(folder, camera.get("label", "")))
+    candidates = _find_images(folder, chunk)
+    warn_of_unused_images(folder, chain.from_iterable(candidates.values()))
+    paths = {camera: _only_image(camera, candidates[camera]) for camera in used}
+    used = existing(folder, used, paths.__getitem__)
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
-    images = [_find_image(folder, camera.get("label", "")) for camera in used]
-    known = [_find_image(folder, camera.get("label", "")) for camera in chunk.iter("camera")]
-    warn_of_unused_images(folder, known)
+    used = _with_calibration(file, used, sensors)
+    images = [paths[camera] for camera in used]
     posed = []
     for camera, image in zip(used, images, strict=True):
         label = camera.get("label", "")
@@ -75,7 +83,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         cameras, frames = rig
         return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
     entries = []
-    for image, name in zip(posed, names_from_paths(images), strict=True):
+    names = names_from_paths([image.removeprefix("images/") for image in images])
+    for image, name in zip(posed, names, strict=True):
         pose = {"R": image.R.tolist(), "t": (-image.R @ image.center).tolist()}
         entries.append({"name": name, **image.lens, **pose, "image": image.path, "mask": image.mask})
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
@@ -121,24 +130,67 @@ def _warn_of_others(file: Path, chunk: Element, used: list[Element]) -> None:
         warn(f"{file}: {reason}: {listed(labels)}")
 
 
-def _find_image(folder: Path, label: str) -> str:
-    """The path of the image with this label, which often lacks the suffix."""
-    label = label.replace("\\", "/")
-    for place in ("", "images/"):
-        for path in files_like(folder / place, "*") if (folder / place).is_dir() else ():
-            if path.name == label or (path.stem == label and path.suffix.lower() not in (".xml", ".txt")):
-                return place + path.name
-    return f"images/{label}"
+def _with_calibration(
+    file: Path, used: Sequence[Element], sensors: Mapping[str | None, Element]
+) -> list[Element]:
+    """The cameras whose sensor has a calibration, with a warning of the others; all of them if fewer than two have."""
+    calibrated = [camera for camera in used if _calibration(sensors.get(camera.get("sensor_id"))) is not None]
+    if len(calibrated) == len(used) or len(calibrated) < 2:
+        return list(used)
+    labels = [camera.get("label", "") for camera in used if camera not in calibrated]
+    warn(f"{file}: photos whose sensor has no calibration are left out: {listed(labels)}")
+    return calibrated
+
+
+def _find_images(folder: Path, chunk: Element) -> dict[Element, list[str]]:
+    """The images that may be each photo's, in the folder or below `images`; the expected path if there is none.
+
+    A photo's label is the name of its file, often without the suffix. Photos in several folders may
+    share a label. Their groups then have the names of the folders.
+    """
+    places = [*files_like(folder, "*"), *files_like(folder / "images", "**/*")]
+    by_label: dict[str, list[str]] = {}
+    for path in (path for path in places if path.suffix.lower() in IMAGE_SUFFIXES):
+        relative = path.relative_to(folder).as_posix()
+        for label in (path.name, path.stem):
+            by_label.setdefault(label, []).append(relative)
+    groups = {camera: group for group in chunk.iter("group") for camera in group.findall("camera")}
+    found = {}
+    for camera in _cameras(chunk):
+        label = camera.get("label", "").replace("\\", "/")
+        parent, _, name = label.rpartition("/")
+        paths = [path for path in by_label.get(name, []) if f"/{path}".rpartition("/")[0].endswith(parent)]
+        group = groups[camera].get("label", "") if camera in groups else ""
+        in_group = [path for path in paths if path.split("/")[-2:-1] == [group]]
+        at_top = [path for path in paths if path.rpartition("/")[0] in ("", "images")]
+        found[camera] = in_group or at_top[:1] or paths or [f"images/{label}"]
+    return found
+
+
+def _only_image(camera: Element, candidates: Sequence[str]) -> str:
+    """The only image that may be a photo's; ValueError if there are several."""
+    if len(candidates) > 1:
+        label = camera.get("label", "")[:80]
+        raise ValueError(
+            f"expected one image of the photo '{label}', got {listed(candidates)}; put the photos of each folder in a "
+            "group of the folder's name in Metashape and export again"
+        )
+    return candidates[0]
+
+
+def _calibration(sensor: Element | None) -> Element | None:
+    """The adjusted calibration of a sensor, else the first one; None if it has none."""
+    found = [] if sensor is None else sensor.findall("calibration")
+    return next((c for c in found if c.get("class") == "adjusted"), found[0] if found else None)
 
 
 def _lens(name: str, sensor: Element | None) -> dict[str, Any]:
-    found = [] if sensor is None else sensor.findall("calibration")
-    lens = next((c for c in found if c.get("class") == "adjusted"), found[0] if found else None)
-    if (
-        lens is None
-        or lens.get("type", "frame") != "frame"
-        or any(_value(name, lens, key) for key in UNSUPPORTED)
-    ):
+    lens = _calibration(sensor)
+    if lens is None:
+        raise ValueError(
+            f"camera '{name}': expected a sensor with a calibration, got none; align the photos, and export again"
+        )
+    if lens.get("type", "frame") != "frame" or any(_value(name, lens, key) for key in UNSUPPORTED):
         expected = "a calibrated frame lens with k1 to k3, p1, p2"
         raise ValueError(f"camera '{name}': expected {expected}, got another; undistort the images first")
     width, height = (int(side) for side in xml_attributes(name, lens.find("resolution"), "width height"))
