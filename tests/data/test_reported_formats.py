@@ -134,7 +134,7 @@ def test_footage_next_to_incomplete_files_of_opencv_is_named(tmp_path, caplog):
     assert f"no calibrated camera is not used: {rig[3]['name']}" in caplog.text
 
 
-def test_a_second_calibration_is_named(tmp_path, caplog):
+def test_a_second_file_of_a_rig_is_named(tmp_path, caplog):
     rig = rig_of(3)
     for name in ("a.qca.txt", "b.qca.txt"):
         write_qualisys(tmp_path / name, rig)
@@ -161,6 +161,21 @@ def test_footage_one_folder_deeper_is_named(tmp_path):
     for camera in rig:
         write_film(tmp_path / f"videos/{camera['name']}/100GOPRO/GX010042.MP4", [picture(0)])
     with pytest.raises(CaptureError, match=r"got some in videos/\w+/100GOPRO alone; move them up"):
+        open_capture(tmp_path)
+
+
+def test_a_camera_may_have_its_film_in_a_folder_of_its_own(tmp_path):
+    rig = rig_of(4)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    films = [f"{camera['name']}.mp4" for camera in rig[:3]] + [f"{rig[3]['name']}/GX010042.MP4"]
+    masks = [*films[1:], f"{rig[0]['name']}/mask.mp4"]
+    for place, names in (("videos", films), ("masks", masks)):
+        for name in names:
+            write_film(tmp_path / place / name, [picture(n) for n in range(3)])
+    capture = open_capture(tmp_path)
+    assert len(capture.cameras) == 4 and capture.has_masks
+    write_film(tmp_path / f"videos/{rig[3]['name']}/GX020042.MP4", [picture(3)])
+    with pytest.raises(CaptureError, match=rf"one video of camera '{rig[3]['name']}', got 2 .*GX020042"):
         open_capture(tmp_path)
 
 
@@ -338,6 +353,19 @@ def test_times_of_colmap_are_frames(tmp_path, layout, shift, binary):
     assert found.keys() == {camera["name"] for camera in rig}
     for camera in rig:
         np.testing.assert_allclose(found[camera["name"]], -camera["R"].T @ camera["t"], atol=0.01)
+
+
+def test_photos_of_none_of_the_moments_are_left_out_and_named(tmp_path, caplog):
+    """Photos of the empty room help COLMAP to place a rig that was recorded at several times."""
+    rig = rig_of(3)
+    images = several_times(rig, "{camera}/{time:06d}")
+    more = several_times(random_rig(9, 3), "room/DSC_{camera}")[:3]
+    room = [camera | {"width": 64, "height": 48} for camera in more]
+    write_flat_images(tmp_path, images + room)
+    write_colmap(tmp_path, opencv(images + room), binary=False)
+    capture = open_capture(tmp_path)
+    assert set(capture.cameras.names) == {camera["name"] for camera in rig} and len(capture.frame_ids) == 3
+    assert re.search("none of the rig's moments are left out: images/room/DSC_.*png", caplog.text)
 
 
 def test_a_rig_of_colmap_that_moves_is_refused(tmp_path):

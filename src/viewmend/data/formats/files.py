@@ -310,11 +310,17 @@ def _found_footage(folder: Path, names: Sequence[str], paths: Sequence[str]) -> 
 
 
 def _footage_in(folder: Path, place: str) -> Iterator[list[str]]:
-    """The videos of a place, then its folders; in `recordings`, also those of its only subfolder."""
+    """The videos of a place, then its folders, then both; in `recordings`, also those of its only subfolder."""
     only = [f"{place}/{name}" for name in _subfolders(folder / place)] if place == "recordings" else []
     for where in (place, *(only if len(only) == 1 else ())):
-        yield _videos(folder, where)
-        yield _folders(folder, where)
+        yield from _videos_or_folders(folder, where)
+
+
+def _videos_or_folders(folder: Path, place: str) -> tuple[list[str], list[str], list[str]]:
+    """The videos of a place, its folders, and both: some cameras may have a video, and others a folder."""
+    videos = _videos(folder, place)
+    folders = _folders(folder, place)
+    return videos, folders, videos + folders
 
 
 def _without_footage(folder: Path, names: Sequence[str], places: Sequence[str]) -> str:
@@ -582,9 +588,7 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str,
     if not places:
         return {}
     place = next((place for place in places if _videos(folder, place) or _folders(folder, place)), places[0])
-    match = max(
-        _match_some(names, _videos(folder, place)), _match_some(names, _folders(folder, place)), key=len
-    )
+    match = max((_match_some(names, paths) for paths in _videos_or_folders(folder, place)), key=len)
     if match.several:
         raise ValueError(f"{place}: {_several_videos(match.several)}")
     absent = [name for name in names if name not in match.paths]
@@ -593,8 +597,7 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str,
         raise ValueError(f"expected {expected}, got none of {listed(absent)}; name them after the cameras")
     labels = {"mask_labels": True} if place in LABELS else {}
     found = {}
-    for name in names:
-        path = match.paths[name]
+    for name, path in _choose_videos(folder, {name: match.paths[name] for name in names}).items():
         images = None if is_video(path) else list_images(folder, path)
         pattern = images.pattern if images else path if is_video(path) else f"{path}/{{frame}}.png"
         found[name] = {"mask": pattern} | labels, images.frames if images else frozenset()

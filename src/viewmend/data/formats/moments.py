@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from viewmend.data.formats.files import frame_order, frame_pattern, names_of_patterns
+from viewmend.data.formats.files import frame_order, frame_pattern, listed, names_of_patterns, warn
 
 POSE_DIGITS = 6
 """Poses that are equal to this many decimals are those of one camera."""
@@ -50,21 +50,24 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
         return None
     patterns = [_pattern([images[index].path for index in group]) for group in groups]
     ids = sorted({frame for _, found in patterns for frame in found}, key=frame_order)
+    strangers = [pattern for pattern, _ in patterns if _complete(pattern, ids) is None]
+    if strangers and len(patterns) - len(strangers) > 1:
+        warn(f"images of none of the rig's moments are left out: {listed(strangers)}")
+        groups = [group for group in groups if images[group[0]].path not in strangers]
+        patterns = [own for own in patterns if own[0] not in strangers]
     counts = [sum(frame in found for _, found in patterns) for frame in ids]
     shared = [count for count in counts if 2 * count > len(groups)]
     if 2 * len(shared) < len(counts):
         first, second = (images[group[0]].path for group in groups[:2])
         expected = "the same number in the names of all cameras' images of one moment"
         raise ValueError(f"expected {expected}, got others (such as {first} and {second}); rename the images")
-    names = names_of_patterns([_completed(pattern, ids) for pattern, _ in patterns])
+    paths = [_completed(pattern, ids) for pattern, _ in patterns]
     cameras = []
-    for name, group, (pattern, _) in zip(names, groups, patterns, strict=True):
+    for name, group, path in zip(names_of_patterns(paths), groups, paths, strict=True):
         masks = [mask for index in group if (mask := images[index].mask) is not None]
         mask = _completed(_pattern(masks)[0], ids) if len(masks) == len(group) else None
         pose = _mean_pose([images[index] for index in group])
-        cameras.append(
-            {"name": name, **images[group[0]].lens, **pose, "image": _completed(pattern, ids), "mask": mask}
-        )
+        cameras.append({"name": name, **images[group[0]].lens, **pose, "image": path, "mask": mask})
     return cameras, tuple(ids)
 
 
@@ -137,11 +140,21 @@ def _pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
 
 
 def _completed(pattern: str, ids: Sequence[str]) -> str:
-    """The pattern of a single path, by the frame id that it contains."""
+    """The pattern of a single path, by the frame id that it contains; ValueError if it contains none."""
+    completed = _complete(pattern, ids)
+    if completed is None:
+        raise ValueError(
+            f"expected a frame id such as {ids[0]} in {pattern}, got another name; rename the image"
+        )
+    return completed
+
+
+def _complete(pattern: str, ids: Sequence[str]) -> str | None:
+    """The pattern of a single path, by the frame id that it contains; None if it contains none."""
     if "{frame}" in pattern:
         return pattern
     for frame in sorted(ids, key=len, reverse=True):
         before, found, after = pattern.rpartition(frame)
         if found:
             return f"{before}{{frame}}{after}"
-    raise ValueError(f"expected a frame id such as {ids[0]} in {pattern}, got another name; rename the image")
+    return None
