@@ -53,16 +53,8 @@ def _has_chunk(file: Path) -> bool:
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
     """The aligned images of the chunk that has most, in the folder or below `images`, in the chunk's unit."""
-    chunks = read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")
-    chunk = max(chunks, key=lambda chunk: len(_used_cameras(chunk)), default=None)
-    used = [] if chunk is None else _used_cameras(chunk)
-    if chunk is None or not used:
-        raise ValueError(
-            "expected a chunk with aligned cameras, got none; align the photos and export them again"
-        )
-    others = [other.get("label", "") for other in chunks if other is not chunk and _used_cameras(other)]
-    if others:
-        warn(f"{file}: the chunk '{chunk.get('label', '')}' is used, and not {listed(others)}")
+    chunk = _choose_chunk(file)
+    used = _used_cameras(chunk)
     _warn_of_others(file, chunk, used)
     candidates = _find_images(folder, chunk)
     warn_of_unused_images(folder, chain.from_iterable(candidates.values()))
@@ -70,24 +62,43 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     used = existing(folder, used, paths.__getitem__)
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
     used = _with_calibration(file, used, sensors)
-    images = [paths[camera] for camera in used]
-    posed = []
-    for camera, image in zip(used, images, strict=True):
-        label = camera.get("label", "")
-        R, center = _pose(label, camera, chunk)
-        mask = find_mask(folder, image.removeprefix("images/"))
-        lens = _lens(label, sensors.get(camera.get("sensor_id")))
-        posed.append(PosedImage(image, mask, lens, R, center))
+    posed = [
+        _posed(folder, chunk, camera, paths[camera], sensors.get(camera.get("sensor_id"))) for camera in used
+    ]
     rig = fixed_cameras(posed)
     if rig is not None:
         cameras, frames = rig
         return {"first_pixel_center": [0.5, 0.5], "frames": list(frames), "cameras": cameras}
     entries = []
-    names = names_from_paths([image.removeprefix("images/") for image in images])
+    names = names_from_paths([image.path.removeprefix("images/") for image in posed])
     for image, name in zip(posed, names, strict=True):
         pose = {"R": image.R.tolist(), "t": (-image.R @ image.center).tolist()}
         entries.append({"name": name, **image.lens, **pose, "image": image.path, "mask": image.mask})
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
+
+
+def _choose_chunk(file: Path) -> Element:
+    """The chunk with most aligned cameras, with a warning of the others; ValueError if no chunk has any."""
+    chunks = [
+        chunk for chunk in read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk") if _used_cameras(chunk)
+    ]
+    if not chunks:
+        raise ValueError(
+            "expected a chunk with aligned cameras, got none; align the photos and export them again"
+        )
+    largest = max(chunks, key=lambda chunk: len(_used_cameras(chunk)))
+    others = [chunk.get("label", "") for chunk in chunks if chunk is not largest]
+    if others:
+        warn(f"{file}: the chunk '{largest.get('label', '')}' is used, and not {listed(others)}")
+    return largest
+
+
+def _posed(folder: Path, chunk: Element, camera: Element, image: str, sensor: Element | None) -> PosedImage:
+    """A photo with its lens, its pose and its mask."""
+    label = camera.get("label", "")
+    R, center = _pose(label, camera, chunk)
+    mask = find_mask(folder, image.removeprefix("images/"))
+    return PosedImage(image, mask, _lens(label, sensor), R, center)
 
 
 def _used_cameras(chunk: Element) -> list[Element]:

@@ -50,17 +50,9 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
         return None
     patterns = [_pattern([images[index].path for index in group]) for group in groups]
     ids = sorted({frame for _, found in patterns for frame in found}, key=frame_order)
-    strangers = [pattern for pattern, _ in patterns if _complete(pattern, ids) is None]
-    if strangers and len(patterns) - len(strangers) > 1:
-        warn(f"images of none of the rig's moments are left out: {listed(strangers)}")
-        groups = [group for group in groups if images[group[0]].path not in strangers]
-        patterns = [own for own in patterns if own[0] not in strangers]
-    counts = [sum(frame in found for _, found in patterns) for frame in ids]
-    shared = [count for count in counts if 2 * count > len(groups)]
-    if 2 * len(shared) < len(counts):
-        first, second = (images[group[0]].path for group in groups[:2])
-        expected = "the same number in the names of all cameras' images of one moment"
-        raise ValueError(f"expected {expected}, got others (such as {first} and {second}); rename the images")
+    groups = _without_strangers(images, groups, ids)
+    patterns = [_pattern([images[index].path for index in group]) for group in groups]
+    _check_moments(patterns, ids)
     paths = [_completed(pattern, ids) for pattern, _ in patterns]
     cameras = []
     for name, group, path in zip(names_of_patterns(paths), groups, paths, strict=True):
@@ -69,6 +61,33 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
         pose = _mean_pose([images[index] for index in group])
         cameras.append({"name": name, **images[group[0]].lens, **pose, "image": path, "mask": mask})
     return cameras, tuple(ids)
+
+
+def _without_strangers(
+    images: Sequence[PosedImage], groups: list[list[int]], ids: Sequence[str]
+) -> list[list[int]]:
+    """The groups without single images whose names have none of the frame ids, which are named.
+
+    Such photos help a reconstruction only. All groups are kept if fewer than two would be.
+    """
+    strangers = [
+        group for group in groups if len(group) == 1 and _complete(images[group[0]].path, ids) is None
+    ]
+    if not strangers or len(groups) - len(strangers) < 2:
+        return groups
+    names = [images[group[0]].path for group in strangers]
+    warn(f"images of none of the rig's moments are left out: {listed(names)}")
+    return [group for group in groups if group not in strangers]
+
+
+def _check_moments(patterns: Sequence[tuple[str, tuple[str, ...]]], ids: Sequence[str]) -> None:
+    """ValueError unless most cameras share most of the frame ids."""
+    counts = [sum(frame in found for _, found in patterns) for frame in ids]
+    shared = [count for count in counts if 2 * count > len(patterns)]
+    if 2 * len(shared) < len(counts):
+        first, second = (pattern.replace("{frame}", (*found, "")[0]) for pattern, found in patterns[:2])
+        expected = "the same number in the names of all cameras' images of one moment"
+        raise ValueError(f"expected {expected}, got others (such as {first} and {second}); rename the images")
 
 
 def _by_pose(images: Sequence[PosedImage]) -> list[list[int]] | None:
