@@ -36,6 +36,7 @@ from whole_views import detail_scores, perceptual_metrics
 
 from viewmend.completed_cameras import MAX_COMPLETED, complete_views, place_around, with_finer_images
 from viewmend.evaluation.scores import TrueView, true_view
+from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.assets import COMPLETED_SOURCES, FrameAssets, make_assets
@@ -50,6 +51,7 @@ from viewmend.scenes.studio_scenes import procedural_set
 from viewmend.stream import Geometry, Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.types import Silhouettes
 
 SETS = ("../shared/captures/wd2:8", "../shared/captures/utrecht:all", "P", "turn")
 TURN_SEED = 10001
@@ -219,8 +221,8 @@ def draw(
     frame: LeaveOneOutFrame, host: Host, page: Any, scores: SetScores, paints: int, geometry: Geometry
 ) -> dict[str, Float[Tensor, "3 height width"]]:
     """The left-out camera's view by the model, and as the page draws it, `paints` times to be timed."""
-    config = StreamConfig(geometry=geometry, memory_mb=None)
-    stream = Stream(make_method("views"), config, frame.bounds)
+    model = make_method("views")
+    stream = Stream(model, StreamConfig(memory_mb=None), frame.bounds)
     cached = stream.add_frame(frame.inputs)
     proxy = cached.proxy
     assert isinstance(proxy, GeometryProxy), "no other geometry was given"
@@ -237,6 +239,12 @@ def draw(
     start_s = time.process_time()
     views = complete_views(stream, cached, virtual)
     scores.view_cpu_s.append((time.process_time() - start_s) / len(virtual))
+    if geometry == "fused":
+        assert frame.inputs.mask is not None, "the frame has a hull"
+        masks = Silhouettes(frame.inputs.mask, rig)
+        start_s = time.process_time()
+        proxy = fuse_geometry(cached, masks, model, stream.config.render, stream.config.fusion)
+        print(f"fused in {time.process_time() - start_s:.1f} s of processor time", flush=True)
     plain = make_assets(frame.inputs, proxy, stream.config.render)
     host.frame = make_assets(frame.inputs, proxy, stream.config.render, views)
     scores.real_bytes.append(plain.size_bytes)

@@ -15,6 +15,7 @@ from viewmend.models.base import ContextProvider, DepthMap, Inpainter, RenderQua
 from viewmend.rendering.crop import grid_px, mesh_crop
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.types import Silhouettes
+from viewmend.utils.cancellation import stop_if_cancelled
 
 LEAST_SIDE_PX = 16
 """The sides of the views whose depth is predicted have at least this many pixels."""
@@ -34,6 +35,9 @@ def fuse_geometry(
 
     Returns:
         The fused proxy, or the hull as it is where it is empty or no camera can be used.
+
+    Raises:
+        CancelledError: nobody needs the result any more (`cancellable`).
     """
     hull = cached.proxy
     assert isinstance(hull, GeometryProxy)
@@ -45,6 +49,7 @@ def fuse_geometry(
     )
     predicted = []
     for number in range(len(views)):
+        stop_if_cancelled()
         camera = _resized(views[number], hull.bounds, config.view_px).to(cached.frame.rgb.device)
         found = _predict(cached, camera, model, render)
         if found is not None:

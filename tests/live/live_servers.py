@@ -30,9 +30,21 @@ from viewmend.live.protocol import Camera
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
+from viewmend.models.base import DepthMap
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView, IncompleteView
+
+
+class SmallerFill(SmoothFill):
+    """Predicts the proxy's depth, moved away by 20 cm, so that fused meshes are smaller than hulls."""
+
+    predicts_depth = True
+
+    def predict_depth(self, view, context):
+        inside = (view.depth > 0).float()
+        return DepthMap((view.depth + 0.2) * inside, inside)
+
 
 CAMERAS = ring(12)[[0, 1, 2, 4, 7, 9]]
 PIPELINE = StreamConfig(hull=HullConfig(resolution=32))

@@ -1,13 +1,23 @@
-"""Completed virtual cameras that are made while no viewer waits: which, when, and how pages get them."""
+"""Meshes and completed virtual cameras that are made while no viewer waits: which, when, and how pages get them."""
 
 import contextlib
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
-from live.live_servers import CAMERAS, WAIT_S, get, open_websocket, running, say_hello, wait_until
-from live.test_assets import read_image
+from live.live_servers import (
+    CAMERAS,
+    WAIT_S,
+    SmallerFill,
+    get,
+    open_websocket,
+    running,
+    say_hello,
+    wait_until,
+)
+from live.test_assets import read_image, read_shape
 from reference.ball import BallCapture
 
 from viewmend.live.assets import Asset, CompletedImage
@@ -40,6 +50,15 @@ class RingRenderer(Renderer):
         return CompletedImage({"number": 100 + number}, Asset(bytes(IMAGE_BYTES), "image/jpeg"))
 
 
+class FusingRenderer(RingRenderer):
+    """Makes empty meshes, too."""
+
+    fuses_ahead = True
+
+    def fuse_mesh(self, index, without):
+        return Asset(b"mesh", "application/octet-stream")
+
+
 def shown(time: int, eye=None, frame_s=math.inf, without=()) -> ShownFrame:
     return ShownFrame(time, without, eye, frame_s)
 
@@ -65,6 +84,34 @@ def test_only_frames_that_a_page_draws_are_completed(ahead):
     assert make_all(ahead, shown(0)) == list(range(COUNT))
     assert ahead.counts() == {(0, ()): COUNT} and ahead.changes == COUNT
     assert ahead.image((0, ()), 103) is not None and ahead.image((0, ()), 3) is None
+
+
+def test_the_mesh_comes_before_the_views():
+    ahead = CompletedAhead(FusingRenderer())
+    ahead.note_drawn((0, ()))
+    assert make_all(ahead, shown(0)) == [None, *range(COUNT)]
+    assert ahead.counts() == {(0, ()): 1 + COUNT} and ahead.changes == 1 + COUNT
+    mesh = ahead.mesh((0, ()))
+    assert mesh is not None and mesh.content == b"mesh" and ahead.mesh((1, ())) is None
+
+
+def test_a_mesh_that_takes_longer_than_a_frame_does_not_keep_views_from_playing_frames(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("viewmend.live.completed_ahead.time.monotonic", lambda: now[0])
+    ahead = CompletedAhead(FusingRenderer())
+    fuse = ahead._renderer.fuse_mesh
+
+    def slow(*frame):
+        now[0] += 0.5
+        return fuse(*frame)
+
+    ahead._renderer.fuse_mesh = slow
+    ahead.note_drawn((0, ()))
+    ahead.note_drawn((1, ()))
+    ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
+    order = ahead.choose([shown(1, frame_s=0.1)])
+    assert order is not None and order.number is not None
+    assert ahead.choose([shown(1, frame_s=0.6)]).number is None
 
 
 def test_views_near_the_viewer_come_first(ahead):
@@ -157,6 +204,27 @@ def test_a_page_gets_completed_views_as_further_source_images(without):
             rgb, mask = read_image(content, camera)
             assert rgb.shape[:2] == mask.shape == (camera["height"], camera["width"]) and mask.max() > 200
         assert get(f"{server.url}/assets/0/{real + 4}?v={version}")[0] == 404
+
+
+def volume_m3(about, arrays) -> float:
+    """The volume within a closed mesh: the sum of signed tetrahedra between its faces and the origin."""
+    positions = np.array(about["positions"]["low"]) + about["positions"]["step"] * arrays["positions"]
+    a, b, c = positions[arrays["faces"].reshape(-1, 3)].swapaxes(0, 1)
+    return float((a * np.cross(b, c)).sum()) / 6
+
+
+def test_a_page_gets_a_mesh_fused_from_predicted_depth():
+    with running(inpainter=SmallerFill(), completed_cameras=2) as server, page_of(server) as page:
+        version = server.service.renderer.assets_version
+        assert hear_completed(page, 2)["mesh"] is True
+        _, about, hull = read_shape(get(f"{server.url}/assets/0?v={version}")[2])
+        status, headers, content = get(f"{server.url}/assets/0/mesh?v={version}")
+        assert status == 200 and "immutable" in headers["Cache-Control"]
+        header, small, fused = read_shape(content)
+        assert header["time"] == 0 and "cameras" not in header and header["blend"]
+
+        assert 0.1 * volume_m3(about, hull) < volume_m3(small, fused) < 0.8 * volume_m3(about, hull)
+        assert get(f"{server.url}/assets/1/mesh?v={version}")[0] == 404, "this frame was not shown"
 
 
 def test_without_a_page_that_draws_nothing_is_completed_ahead():

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -82,8 +82,9 @@ class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Path and query of an asset."""
 
     time: protocol.Count
-    camera: protocol.Count | None = None
-    """Number of the camera in the frame's list; None for the shape."""
+    camera: protocol.Count | Literal["mesh"] | None = None
+    """Number of the camera in the frame's list; "mesh" for the mesh that was fused from predicted
+    depth; None for the shape."""
     v: protocol.ShortText = ""
     """The version in the message `rig`, with which the response never changes."""
     without: Annotated[str, Meta(max_length=4096)] = ""
@@ -230,6 +231,18 @@ def make_assets(
         more_cameras, more_images = completed_assets(completed, jpeg_quality)
         cameras += more_cameras
         images += more_images
+    return FrameAssets(_pack_shape(frame, proxy, config, {"cameras": cameras}), tuple(images))
+
+
+def make_mesh(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig) -> Asset:
+    """Another mesh of a frame with masks: a shape without the list of cameras."""
+    return _pack_shape(frame, proxy, config, {})
+
+
+def _pack_shape(
+    frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig, fields: dict[str, Any]
+) -> Asset:
+    """The mesh and the blending rule, with more fields in the header."""
     arrays = _shape_arrays(frame, proxy)
     vertices = proxy.mesh.vertices
     blend = config.blend
@@ -237,7 +250,7 @@ def make_assets(
     header: dict[str, Any] = {
         "time": frame.time,
         "center": (vertices.mean(0) if len(vertices) else proxy.bounds.center).tolist(),
-        "cameras": cameras,
+        **fields,
         "blend": {
             "cameras": config.cameras,
             "normal_power": blend.normal_power,
@@ -253,8 +266,7 @@ def make_assets(
             for name, (values, more) in arrays.items()
         ],
     }
-    shape = Asset(pack(header, list(packed.values())), "application/octet-stream")
-    return FrameAssets(shape, tuple(images))
+    return Asset(pack(header, list(packed.values())), "application/octet-stream")
 
 
 def completed_assets(

@@ -1,11 +1,11 @@
-"""Completed virtual cameras of the frames that pages draw, made while no viewer waits for a view."""
+"""Fused meshes and completed virtual cameras of the frames that pages draw, made while no viewer waits for a view."""
 
 import logging
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch.nn.functional as F
 
@@ -15,7 +15,7 @@ from viewmend.live.sessions import ShownFrame
 from viewmend.utils.cancellation import CancelledError
 
 RETRY_S = 10.0
-"""Playing frames are tried again after this many seconds, if one view took longer than one frame."""
+"""Playing frames are tried again after this many seconds, if a mesh or view took longer than one frame."""
 MAX_DRAWN = 64
 """Frames that pages have asked for and that are remembered."""
 
@@ -24,16 +24,34 @@ log = logging.getLogger("viewmend.live")
 
 @dataclass(frozen=True)
 class CompletedOrder:
-    """One completed view to make."""
+    """One mesh or completed view to make."""
 
     key: FrameKey
     """The frame, and the cameras that are left out."""
-    number: int
-    """Number of the virtual camera."""
+    number: int | None
+    """Number of the virtual camera; None for the mesh."""
+
+
+@dataclass
+class MadeAhead:
+    """What was made of a frame."""
+
+    mesh: Asset | None = None
+    images: dict[int, CompletedImage] = field(default_factory=dict)
+    """Completed views by the number of their virtual camera."""
+
+    def count(self) -> int:
+        """The number of meshes and completed views."""
+        return len(self.images) + (self.mesh is not None)
+
+    def size_bytes(self) -> int:
+        """Bytes of all of them."""
+        mesh_bytes = 0 if self.mesh is None else len(self.mesh.content)
+        return mesh_bytes + sum(len(image.asset.content) for image in self.images.values())
 
 
 class CompletedAhead:
-    """Chooses which view to complete next, and keeps those that were made. Callable from any thread."""
+    """Chooses what to make next, and keeps what was made. Callable from any thread."""
 
     def __init__(self, renderer: Renderer, memory_mb: float = MEMORY_MB) -> None:
         self._renderer = renderer
@@ -42,16 +60,16 @@ class CompletedAhead:
         self._version: str | None = None
         self._drawn: OrderedDict[FrameKey, None] = OrderedDict()
         """Frames that pages draw; the ones asked for last at the end."""
-        self._made: OrderedDict[FrameKey, dict[int, CompletedImage]] = OrderedDict()
-        """Completed views by the number of their virtual camera; the frames used last at the end."""
+        self._made: OrderedDict[FrameKey, MadeAhead] = OrderedDict()
+        """What was made of each frame; the frames used last at the end."""
         self._size_bytes = 0
         self._failed: set[FrameKey] = set()
-        self._view_s = 0.0
-        """Seconds that the last view took; at least as long as it took until one was given up."""
+        self._took_s = {"mesh": 0.0, "view": 0.0}
+        """Seconds that the last one of each kind took; at least as long as it took until one was given up."""
         self._tried_s = -RETRY_S
-        """When a view of a playing frame was last begun."""
+        """When something of a playing frame was last begun."""
         self.changes = 0
-        """Grows with every completed view."""
+        """Grows with every mesh and completed view."""
 
     def note_drawn(self, key: FrameKey) -> None:
         """Note that a page draws a frame: it has asked for its assets."""
@@ -63,16 +81,22 @@ class CompletedAhead:
                 self._drawn.popitem(last=False)
 
     def counts(self) -> dict[FrameKey, int]:
-        """The number of completed views of each frame that has some."""
+        """The number of meshes and completed views of each frame that has some."""
         with self._lock:
             self._forget_other_rigs()
-            return {key: len(made) for key, made in self._made.items()}
+            return {key: made.count() for key, made in self._made.items()}
+
+    def mesh(self, key: FrameKey) -> Asset | None:
+        """The mesh of a frame that was fused from predicted depth; None if it was not made."""
+        with self._lock:
+            self._forget_other_rigs()
+            return self._made.get(key, MadeAhead()).mesh
 
     def images(self, key: FrameKey) -> tuple[CompletedImage, ...]:
         """The completed views of a frame that were made so far."""
         with self._lock:
             self._forget_other_rigs()
-            return tuple(self._made.get(key, {}).values())
+            return tuple(self._made.get(key, MadeAhead()).images.values())
 
     def image(self, key: FrameKey, number: int) -> Asset | None:
         """The image of a virtual camera, by its number among the frame's assets; None if it was not made."""
@@ -80,7 +104,7 @@ class CompletedAhead:
         return next((image.asset for image in made if image.camera["number"] == number), None)
 
     def choose(self, shown: Sequence[ShownFrame]) -> CompletedOrder | None:
-        """The view to complete next: for the first of these frames that lacks some, the closest to its viewer."""
+        """The mesh of the first of these frames that lacks something, then the view closest to its viewer."""
         rig = self._renderer.virtual_cameras
         home = self._renderer.home
         if rig is None or home is None:
@@ -88,14 +112,13 @@ class CompletedAhead:
         with self._lock:
             self._forget_other_rigs()
             for view in shown:
-                made = self._made.get(view.key, {})
-                left = [number for number in range(len(rig)) if number not in made]
-                if (
-                    view.key not in self._drawn
-                    or view.key in self._failed
-                    or not left
-                    or not self._is_in_time(view)
-                ):
+                if view.key not in self._drawn or view.key in self._failed:
+                    continue
+                made = self._made.get(view.key, MadeAhead())
+                if made.mesh is None and self._renderer.fuses_ahead and self._is_in_time(view, "mesh"):
+                    return CompletedOrder(view.key, None)
+                left = [number for number in range(len(rig)) if number not in made.images]
+                if not left or not self._is_in_time(view, "view"):
                     continue
                 nearest = left[0]
                 if view.eye is not None:
@@ -105,12 +128,12 @@ class CompletedAhead:
                 return CompletedOrder(view.key, nearest)
         return None
 
-    def _is_in_time(self, view: ShownFrame) -> bool:
-        """Whether a view is probably completed before the next frame is shown."""
-        return self._view_s < view.frame_s or time.monotonic() - self._tried_s > RETRY_S
+    def _is_in_time(self, view: ShownFrame, kind: str) -> bool:
+        """Whether a mesh or a view is probably made before the next frame is shown."""
+        return self._took_s[kind] < view.frame_s or time.monotonic() - self._tried_s > RETRY_S
 
     def make(self, order: CompletedOrder) -> None:
-        """Complete a view and keep it; called on the render thread.
+        """Make a mesh or complete a view, and keep it; called on the render thread.
 
         Raises:
             CancelledError: a viewer waits for a view, or the frame is no longer shown.
@@ -118,31 +141,41 @@ class CompletedAhead:
         start = time.monotonic()
         version = self._renderer.assets_version
         self._tried_s = start
+        kind = "mesh" if order.number is None else "view"
         try:
-            made = self._renderer.complete_virtual_camera(*order.key, order.number)
+            if order.number is None:
+                made = self._renderer.fuse_mesh(*order.key)
+            else:
+                made = self._renderer.complete_virtual_camera(*order.key, order.number)
         except CancelledError:
-            self._view_s = max(self._view_s, time.monotonic() - start)
+            self._took_s[kind] = max(self._took_s[kind], time.monotonic() - start)
             raise
-        self._view_s = time.monotonic() - start
+        self._took_s[kind] = time.monotonic() - start
         with self._lock:
             self._forget_other_rigs()
             if version == self._version:
                 self._keep(order, made)
 
     def give_up(self, order: CompletedOrder, error: Exception) -> None:
-        """Complete no more views of a frame whose view failed."""
+        """Make nothing more for a frame for which something failed."""
         log.warning("while completing views of frame %d: %s", order.key[0], error)
         with self._lock:
             self._failed.add(order.key)
 
-    def _keep(self, order: CompletedOrder, image: CompletedImage) -> None:
-        """Add a view, and drop the frames used least recently beyond the memory."""
-        self._made.setdefault(order.key, {})[order.number] = image
+    def _keep(self, order: CompletedOrder, new: Asset | CompletedImage) -> None:
+        """Add a mesh or a view, and drop the frames used least recently beyond the memory."""
+        made = self._made.setdefault(order.key, MadeAhead())
         self._made.move_to_end(order.key)
-        self._size_bytes += len(image.asset.content)
+        self._size_bytes -= made.size_bytes()
+        if isinstance(new, Asset):
+            made.mesh = new
+        else:
+            assert order.number is not None, "views have the numbers of their cameras"
+            made.images[order.number] = new
+        self._size_bytes += made.size_bytes()
         while self._size_bytes > self._max_bytes and len(self._made) > 1:
             _, dropped = self._made.popitem(last=False)
-            self._size_bytes -= sum(len(old.asset.content) for old in dropped.values())
+            self._size_bytes -= dropped.size_bytes()
         self.changes += 1
 
     def _forget_other_rigs(self) -> None:

@@ -316,13 +316,15 @@ class ViewerConnection:
             self._send_soon({"type": "state"} | causes.shared.source | own)
 
     def _send_completed(self) -> None:
-        """List the completed views of each frame whose number of them has changed."""
+        """List what was made ahead of each frame that has more of it than before."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
             if self._sent.completed_of.get(key) != count:
                 index, without = key
                 cameras = [image.camera for image in self._service.ahead.images(key)]
-                message = {"type": "completed", "time": index, "without": without, "cameras": cameras}
+                mesh = self._service.ahead.mesh(key) is not None
+                about = {"type": "completed", "time": index, "without": without}
+                message = about | {"cameras": cameras, "mesh": mesh}
                 self._send_soon(message, f"completed {key}")
         self._sent.completed_of = counts
 

@@ -14,11 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.completed_cameras import complete_views, place_around, with_finer_images
-from viewmend.frame_cache import CachedFrame, cache_frame
+from viewmend.frame_cache import CachedFrame, all_masks, cache_frame
+from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.live.assets import CompletedImage, FrameAssets, completed_assets, make_assets
+from viewmend.live.assets import Asset, CompletedImage, FrameAssets, completed_assets, make_assets, make_mesh
 from viewmend.live.budget import ladder_for
 from viewmend.live.frame_source import FrameSource, RigInfo
 from viewmend.live.poses import HomeView, home_view, rig_json, view_camera
@@ -123,6 +124,8 @@ class Renderer:
         self._source = source
         self._inpainter = inpainter
         self._error_model = error_model
+        depth_models = [model for model in (inpainter, error_model) if model and model.predicts_depth]
+        self._depth_model = depth_models[0] if depth_models else None
         self._config = config or StreamConfig()
         self.ladder = ladder_for(inpainter)
         self._device = device
@@ -287,6 +290,21 @@ class Renderer:
         proxy = cached.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         return proxy.to("cpu")
+
+    @property
+    def fuses_ahead(self) -> bool:
+        """Whether meshes fused from predicted depth are made ahead, as completed views are."""
+        return self._completed_cameras > 0 and self._depth_model is not None
+
+    def fuse_mesh(self, index: int, without: tuple[str, ...]) -> Asset:
+        """A frame's mesh, fused from its hull and predicted depth; errors as `render`."""
+        assert self._depth_model is not None, "see `fuses_ahead`"
+        left_out = self.left_out(without)
+        cached = self._add_frame(self._stream_of(None, left_out), index, left_out)
+        masks = all_masks(cached.frame)
+        render = self._config.render
+        proxy = fuse_geometry(cached, masks, self._depth_model, render, self._config.fusion)
+        return make_mesh(cached.frame, proxy.to("cpu"), render)
 
     def complete_virtual_camera(self, index: int, without: tuple[str, ...], number: int) -> CompletedImage:
         """The view of a virtual camera, as a further source image of a frame; errors as `render`."""

@@ -284,6 +284,8 @@ class LiveServer:
             return error_response(404, f"this frame cannot be drawn: {error}"[:400])
         if asked.camera is None:
             asset = made.shape
+        elif asked.camera == "mesh":
+            asset = self._service.ahead.mesh(key)
         elif asked.camera < len(made.images):
             asset = made.images[asked.camera]
         else:
@@ -291,8 +293,8 @@ class LiveServer:
         if asset is None:
             return error_response(
                 404,
-                f"expected a camera from 0 to {len(made.images) - 1}, or a completed view that was made, got "
-                f"{asked.camera}",
+                f"expected a camera from 0 to {len(made.images) - 1}, or a completed view or mesh that was "
+                f"made, got {asked.camera}",
             )
         return asset_response(request, asset, is_final=asked.v == version)
 

@@ -1,4 +1,4 @@
-"""A server's completed virtual cameras in Chromium: a moving view is drawn from them as soon as they are there."""
+"""What a server makes ahead, in Chromium: a moving view is drawn from it as soon as it is there."""
 
 import re
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from live.browser.conftest import SCREENSHOT_S, opened
 from live.browser.test_page_drawing import silent
-from live.live_servers import CAMERAS, running
+from live.live_servers import CAMERAS, SmallerFill, running
 
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.types import CompletedView
@@ -45,3 +45,25 @@ def test_a_moving_view_is_drawn_from_completed_views_unless_it_is_shown_as_rende
                 is_green = shown[..., 1] - shown[..., [0, 2]].max(-1) > 120
                 share = is_green[bright].mean()
                 assert share > 0.5 if mode == "completed" else share < 0.02, share
+
+
+def shown_area(browser, server, mode: str) -> float:
+    """The share of the canvas that a moving view covers, once the page has all that the server makes ahead."""
+    asked = set()
+    needed = {"mesh", str(len(CAMERAS) + 1)}
+    with opened(browser, server, query=f"?time=0&mode={mode}") as view:
+        view.page.on("request", lambda request: asked.update(re.findall(r"assets/0/(\w+)", request.url)))
+        view.until(lambda: needed <= asked, SCREENSHOT_S)
+        view.page.wait_for_timeout(500)
+        with silent(server):
+            view.drag(120, 0)
+            view.page.wait_for_timeout(300)
+            return float((view.picture().max(-1) > 60).mean())
+
+
+def test_a_moving_view_is_drawn_on_the_fused_mesh_unless_it_is_shown_as_rendered(browser):
+    with running(inpainter=SmallerFill(), completed_cameras=2) as server:
+        rendered = shown_area(browser, server, "rendered")
+        completed = shown_area(browser, server, "completed")
+    assert rendered > 0.02
+    assert 0.1 * rendered < completed < 0.8 * rendered

@@ -125,6 +125,9 @@ const HOLES = { rendered: [0, 0, 0, 1], holes: [1, 0.15, 0.55, 1], completed: [0
 /** Modes that are drawn here. */
 export const DRAWN_MODES = Object.keys(HOLES);
 
+/** The frame as it is drawn in a mode: with the fused mesh if it has one, except where the view is shown as rendered. @param {Frame} frame @param {string} mode @returns {Frame} */
+const meshFor = (frame, mode) => (mode === "rendered" || mode === "holes" ? frame : frame.refined ?? frame);
+
 export class Scene {
   /** @param {WebGL2RenderingContext} gl @param {number} fillers cameras that fill holes */
   constructor(gl, fillers) {
@@ -144,6 +147,12 @@ export class Scene {
 
   /** Let go of a frame's textures. @param {Frame} frame */
   drop(frame) {
+    if (frame.refined) this.#release(frame.refined);
+    this.#release(frame);
+  }
+
+  /** @param {Frame} frame with one of its meshes */
+  #release(frame) {
     const { gl } = this;
     const own = this.kept.get(frame);
     if (!own) return;
@@ -161,14 +170,15 @@ export class Scene {
    * @param {Frame} frame @param {number[]} eye @param {string[]} modes that will be drawn
    */
   prepare(frame, eye, modes) {
-    const own = this.kept.get(frame) ?? this.#upload(frame);
-    this.kept.delete(frame);
-    this.kept.set(frame, own);
-    for (const old of this.kept.keys()) if (this.kept.size > KEPT) this.drop(old);
     for (const mode of modes) {
-      const { first, fill } = this.#sources(frame, eye, mode);
-      for (const n of [...first, ...fill]) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
+      const drawn = meshFor(frame, mode);
+      const own = this.kept.get(drawn) ?? this.#upload(drawn);
+      this.kept.delete(drawn);
+      this.kept.set(drawn, own);
+      const { first, fill } = this.#sources(drawn, eye, mode);
+      for (const n of [...first, ...fill]) if (!own.sources.has(n)) own.sources.set(n, this.#source(drawn, own, n));
     }
+    for (const old of this.kept.keys()) if (this.kept.size > KEPT) this.#release(old);
   }
 
   /** The numbers of the cameras that colour a view, of those whose images are there. @param {Frame} frame @param {number[]} eye @param {string} mode */
@@ -179,16 +189,17 @@ export class Scene {
 
   /** The cut-outs of all cameras' images that are there; as `prepare`. @param {Frame} frame */
   cutOuts(frame) {
-    const own = this.kept.get(frame);
+    const own = this.kept.get(frame) ?? this.kept.get(/** @type {Frame} */ (frame.refined));
     const { cameras } = /** @type {any} */ (frame.shape).header;
     const real = [...frame.images.keys()].filter((n) => !cameras[n].completed);
     for (const n of real) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
     return real.map((n) => ({ camera: cameras[n], picture: own.sources.get(n).picture }));
   }
 
-  /** Draw into a viewport, within the current scissor. @param {Frame} frame @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
-  draw(frame, viewer, eye, mode, viewport, ground) {
+  /** Draw into a viewport, within the current scissor. @param {Frame} wholeFrame @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
+  draw(wholeFrame, viewer, eye, mode, viewport, ground) {
     const { gl } = this;
+    const frame = meshFor(wholeFrame, mode);
     const own = this.kept.get(frame);
     const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
     const { blend, cameras } = shape.header;

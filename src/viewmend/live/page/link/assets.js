@@ -10,7 +10,8 @@ import { dot, sub, unit } from "../view/matrix.js";
  * @property {number} time its index
  * @property {Shape | null} shape
  * @property {Map<number, CameraImage>} images by the camera's number
- * @property {Set<number>} extended numbers of the server's completed views that are there, or that it does not have any more
+ * @property {Set<number | "mesh">} extended numbers of the server's completed views that are there, or that it does not have any more; "mesh" for its fused mesh
+ * @property {Frame | null} refined the same frame with the mesh that the server fused from predicted depth
  * @property {number} since when it was asked for, ms
  * @property {boolean} failed
  */
@@ -86,7 +87,7 @@ export class Assets extends EventTarget {
     this.shown = null;
     /** @type {Set<string>} */
     this.waiting = new Set();
-    /** Completed views that the server has made, by frame: see `named`. @type {Map<string, any[]>} */
+    /** What the server has made ahead, by frame: see `named`. @type {Map<string, {cameras: any[], mesh: boolean}>} */
     this.completed = new Map();
     this.failures = 0;
     /** Grows when all frames are let go of: what was asked for before is of no use. */
@@ -225,21 +226,26 @@ export class Assets extends EventTarget {
     return missing.length === 0;
   }
 
-  /** Completed views of a frame that the server has made. @param {{time: number, without: string[], cameras: any[]}} message */
-  offer({ time, without, cameras }) {
-    this.completed.set(named(time, without), cameras);
+  /** Completed views and the mesh of a frame that the server has made. @param {{time: number, without: string[], cameras: any[], mesh: boolean}} message */
+  offer({ time, without, cameras, mesh }) {
+    this.completed.set(named(time, without), { cameras, mesh });
     this.dispatchEvent(new CustomEvent("change", { detail: undefined }));
   }
 
-  /** The completed views of a frame that are offered. @param {Frame} frame @returns {any[]} */
+  /** What is offered of a frame. @param {Frame} frame */
   #offers({ time }) {
-    return this.completed.get(named(time, this.without.split(",").filter(Boolean))) ?? [];
+    return this.completed.get(named(time, this.without.split(",").filter(Boolean))) ?? { cameras: [], mesh: false };
   }
 
-  /** Ask for the completed view that is closest to the eye, of those that are missing, once all else is there. @param {Frame} frame @param {number[]} eye */
+  /** Ask for the fused mesh, then for the completed view that is closest to the eye, of those that are missing, once all else is there. @param {Frame} frame @param {number[]} eye */
   #extend(frame, eye) {
     if (this.waiting.size) return;
-    const missing = this.#offers(frame).filter(({ number }) => !frame.extended.has(number));
+    const { cameras, mesh } = this.#offers(frame);
+    if (mesh && !frame.extended.has("mesh")) {
+      this.#ask(`${frame.time}/mesh`, null);
+      return;
+    }
+    const missing = cameras.filter(({ number }) => !frame.extended.has(number));
     if (!missing.length) return;
     const { center } = /** @type {Shape} */ (frame.shape).header;
     const near = missing.map((_, n) => nearness({ cameras: missing, center }, eye, n));
@@ -259,7 +265,7 @@ export class Assets extends EventTarget {
   /** @param {number} time @returns {Frame} */
   #add(time) {
     /** @type {Frame} */
-    const frame = { time, shape: null, images: new Map(), extended: new Set(), since: performance.now(), failed: false };
+    const frame = { time, shape: null, images: new Map(), extended: new Set(), refined: null, since: performance.now(), failed: false };
     this.frames.set(time, frame);
     for (const old of this.frames.values()) if (this.frames.size > KEPT) this.#forget(old);
     return frame;
@@ -285,10 +291,12 @@ export class Assets extends EventTarget {
   #take({ key, shape, image, bytes, failed }) {
     this.waiting.delete(key);
     const [round, path] = key.split(" ");
-    const [time, camera] = path.split("/").map(Number);
-    const frame = Number(round) === this.round ? this.frames.get(time) : undefined;
-    const offered = frame && this.#offers(frame).find(({ number }) => number === camera);
+    const [time, part] = path.split("/");
+    const camera = Number(part);
+    const frame = Number(round) === this.round ? this.frames.get(Number(time)) : undefined;
+    const offered = frame && this.#offers(frame).cameras.find(({ number }) => number === camera);
     if (!frame) image?.picture.close();
+    else if (part === "mesh") this.#refine(frame, shape);
     else if (offered) {
       frame.extended.add(camera);
       if (image) frame.images.set(/** @type {Shape} */ (frame.shape).header.cameras.push(offered) - 1, image);
@@ -303,6 +311,14 @@ export class Assets extends EventTarget {
       }
     }
     this.dispatchEvent(new CustomEvent("change", { detail: frame }));
+  }
+
+  /** Keep a frame's fused mesh, which is drawn where completed views are shown. @param {Frame} frame @param {Shape | undefined} mesh undefined if the server does not have it any more */
+  #refine(frame, mesh) {
+    frame.extended.add("mesh");
+    if (!mesh || !frame.shape) return;
+    const header = { ...frame.shape.header, ...mesh.header };
+    frame.refined = { ...frame, shape: { ...mesh, header } };
   }
 
   /** It is tried again when it is wanted the next time round. @param {Frame} frame */
