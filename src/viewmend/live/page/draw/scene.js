@@ -125,9 +125,6 @@ const HOLES = { rendered: [0, 0, 0, 1], holes: [1, 0.15, 0.55, 1], completed: [0
 /** Modes that are drawn here. */
 export const DRAWN_MODES = Object.keys(HOLES);
 
-/** The frame as it is drawn in a mode: with the fused mesh if it has one, except where the view is shown as rendered. @param {Frame} frame @param {string} mode @returns {Frame} */
-const meshFor = (frame, mode) => (mode === "rendered" || mode === "holes" ? frame : frame.refined ?? frame);
-
 export class Scene {
   /** @param {WebGL2RenderingContext} gl @param {number} fillers cameras that fill holes */
   constructor(gl, fillers) {
@@ -171,7 +168,7 @@ export class Scene {
    */
   prepare(frame, eye, modes) {
     for (const mode of modes) {
-      const drawn = meshFor(frame, mode);
+      const drawn = this.#meshFor(frame, eye, mode);
       const own = this.kept.get(drawn) ?? this.#upload(drawn);
       this.kept.delete(drawn);
       this.kept.set(drawn, own);
@@ -179,6 +176,17 @@ export class Scene {
       for (const n of [...first, ...fill]) if (!own.sources.has(n)) own.sources.set(n, this.#source(drawn, own, n));
     }
     for (const old of this.kept.keys()) if (this.kept.size > KEPT) this.#release(old);
+  }
+
+  /**
+   * The frame as it is drawn: with its fused mesh if it has one, except where the view is shown as rendered. Completed views cut
+   * off what the hull has too much, but cannot show what the fused mesh lacks, so they are drawn on the hull.
+   * @param {Frame} frame @param {number[]} eye @param {string} mode @returns {Frame}
+   */
+  #meshFor(frame, eye, mode) {
+    if (!frame.refined || mode === "rendered" || mode === "holes") return frame;
+    const { cameras } = /** @type {any} */ (frame.shape).header;
+    return this.#sources(frame, eye, mode).first.some((n) => cameras[n].completed) ? frame : frame.refined;
   }
 
   /** The numbers of the cameras that colour a view, of those whose images are there. @param {Frame} frame @param {number[]} eye @param {string} mode */
@@ -199,7 +207,7 @@ export class Scene {
   /** Draw into a viewport, within the current scissor. @param {Frame} wholeFrame @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
   draw(wholeFrame, viewer, eye, mode, viewport, ground) {
     const { gl } = this;
-    const frame = meshFor(wholeFrame, mode);
+    const frame = this.#meshFor(wholeFrame, eye, mode);
     const own = this.kept.get(frame);
     const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
     const { blend, cameras } = shape.header;
