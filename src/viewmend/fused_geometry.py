@@ -37,7 +37,7 @@ def fuse_geometry(
         The fused proxy, or the hull as it is where it is empty or no camera can be used.
 
     Raises:
-        CancelledError: nobody needs the result any more (`cancellable`).
+        CancelledError: the result is not needed any more (`cancellable`).
     """
     hull = cached.proxy
     assert isinstance(hull, GeometryProxy)
