@@ -63,7 +63,7 @@ class AutoencoderConfig(ObjectiveConfig):
 
     model: Annotated[PaperConfig, HIDDEN] = field(default_factory=paper_small)
     sampling: Annotated[SamplingConfig, HIDDEN] = SAMPLING
-    objective = AutoencoderObjective
+    objective_class = AutoencoderObjective
     item = Sample
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[Sample]:

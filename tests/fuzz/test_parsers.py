@@ -211,7 +211,7 @@ def test_live_messages():
 def test_manifests(tmp_path):
     with OutputFolder(tmp_path) as folder:
         (tmp_path / "a").write_text("a")
-        folder.made("a")
+        folder.record("a")
 
     def begin():
         with OutputFolder(tmp_path) as folder:

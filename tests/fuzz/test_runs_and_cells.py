@@ -18,7 +18,7 @@ from viewmend.evaluation.scores import KINDS, ViewScores
 from viewmend.models.paper.config import paper_small
 from viewmend.training.config import TrainConfig
 from viewmend.training.paper import PaperObjectiveConfig
-from viewmend.training.run_files import FILE, Log, RunError, RunState, load_run, save_run
+from viewmend.training.run_files import CHECKPOINT, Log, RunError, RunState, load_run, save_run
 
 
 def test_runs(tmp_path):
@@ -29,7 +29,7 @@ def test_runs(tmp_path):
     optimizer.step()
     parts = ({"model": module}, {"optimizer": optimizer})
     save_run(tmp_path, config, RunState(1, 2.0, ()), *parts)
-    path = tmp_path / FILE
+    path = tmp_path / CHECKPOINT
     good = path.read_bytes()
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()

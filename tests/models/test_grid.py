@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project
 from viewmend.models.views.grid import (
-    AT_ONCE,
+    TILES_AT_ONCE,
     BAND_PX,
     CELL_PX,
     TILE_PX,
@@ -147,7 +147,7 @@ def test_only_tiles_with_pixels_pass_the_layers_in_few_batch_sizes(monkeypatch):
     monkeypatch.setattr(F, "conv2d", lambda x, *rest: shapes.append(tuple(x.shape)) or own(x, *rest))
     run_tiled(layers, cells, torch.ones(10, 1), torch.stack([at, at], 1), shape)
     first = [size for size in shapes if size[1] == 3]
-    assert sum(size[0] for size in first) == 10 and {size[0] for size in first} <= set(AT_ONCE)
+    assert sum(size[0] for size in first) == 10 and {size[0] for size in first} <= set(TILES_AT_ONCE)
     assert {size[2:] for size in first} == {(TILE_PX + 6, TILE_PX + 6)}
 
 

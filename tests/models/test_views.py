@@ -11,7 +11,7 @@ from viewmend.models.views import model, prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import detail_bands, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.prediction import remains_of_phantoms
+from viewmend.models.views.prediction import artefact_islands
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.rendering.crop import Crop
 from viewmend.stream import Stream
@@ -222,22 +222,22 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
         *((16, 0.4, False, True), (2, 1.0, True, True)),
     ],
 )
-def test_remains_of_phantoms_are_small(side, alpha, rendered, stays):
+def test_artefact_islands_are_small(side, alpha, rendered, stays):
     """Tiny islands are, and small faint ones; not those of which any pixel was rendered."""
     coverage, predicted = torch.zeros(83, 96), torch.ones(83, 96, dtype=torch.bool)
     coverage[:60, :80] = 1.0
     coverage[64 : 64 + side, 64 : 64 + side] = alpha
     predicted[64, 64] = not rendered
-    remains = remains_of_phantoms(0.5 * coverage, coverage, predicted)
+    remains = artefact_islands(0.5 * coverage, coverage, predicted)
     island = (coverage > 0) & (torch.arange(83) > 60)[:, None]
     assert torch.equal(remains, torch.zeros_like(predicted) if stays else island)
 
 
-def test_remains_of_phantoms_are_removed_from_all_images(scene, monkeypatch):
+def test_artefact_islands_are_removed_from_all_images(scene, monkeypatch):
     stream, view, _ = scene
     before, there = stream.mend(view).completed, torch.zeros_like(view.mask, dtype=torch.bool)
     there[30:40, 30:40] = True
-    monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: there & predicted)
+    monkeypatch.setattr(prediction, "artefact_islands", lambda colour, alpha, predicted: there & predicted)
     after, gone = stream.mend(view).completed, there & (view.error > 0)
     assert bool(gone.any()) and all(
         float(image[..., gone].abs().max()) == 0 for image in after.images.values()

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 from training.conftest import log_of
 
-from viewmend.training.run_files import FILE
+from viewmend.training.run_files import CHECKPOINT
 
 SCRIPT = """
 import sys
@@ -53,7 +53,7 @@ def started(out, steps, shards, streams=1, launcher=(), text=SCRIPT):
 @pytest.mark.slow
 def test_a_killed_run_resumes_from_a_whole_checkpoint(shards, tmp_path):
     run = started(tmp_path / "killed", 1000, shards)
-    while len(log_of(tmp_path / "killed")) < 4 or not (tmp_path / "killed" / FILE).exists():
+    while len(log_of(tmp_path / "killed")) < 4 or not (tmp_path / "killed" / CHECKPOINT).exists():
         assert run.poll() is None, (tmp_path / "killed.log").read_text()[-3000:]
         time.sleep(0.02)
     run.send_signal(signal.SIGKILL)

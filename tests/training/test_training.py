@@ -17,7 +17,7 @@ from viewmend.models.compositing import composite
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.training.loop import Run, RunClock, averaging, join_processes, train
 from viewmend.training.paper import PaperObjective
-from viewmend.training.run_files import FILE, RunError
+from viewmend.training.run_files import CHECKPOINT, RunError
 from viewmend.training.samples import true_image
 from viewmend.training.shards import sample_from_bytes
 
@@ -91,7 +91,7 @@ def test_checkpoints_are_due_by_time(tiny, monkeypatch):
     for seconds in (0, 119, 1):
         now[0] += seconds
         due.append(clock.checkpoint_due())
-    clock.saved()
+    clock.note_checkpoint()
     assert due == [False, False, True] and not clock.checkpoint_due()
     now[0] += 60 * 3
     assert RunClock(replace(tiny, minutes=10.0), 0, 30.0).progress(0) == pytest.approx(0.05)
@@ -113,8 +113,8 @@ def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path)
     other = with_options(replace(tiny, batch=3, learning_rate=1.0), adversarial=0.5)
     with pytest.raises(RunError, match=r"differs in objective\.adversarial, batch, learning_rate"):
         train(with_options(other, adversarial=0.5), tmp_path)
-    whole = (tmp_path / FILE).read_bytes()
-    (tmp_path / FILE).write_bytes(whole[: len(whole) // 2])
+    whole = (tmp_path / CHECKPOINT).read_bytes()
+    (tmp_path / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RunError, match=r"run\.safetensors: expected a run to resume"):
         train(tiny, tmp_path)
 
@@ -136,10 +136,10 @@ def test_automatic_precision_is_the_faster_one_and_a_run_resumes_where_the_other
 def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, tmp_path, every_two):
     train(tiny, tmp_path / "whole")
     train(tiny, tmp_path / "parts")
-    (tmp_path / "parts" / FILE).write_bytes(b"damaged")
+    (tmp_path / "parts" / CHECKPOINT).write_bytes(b"damaged")
     with pytest.raises(RunError, match=r"rename run\.previous\.safetensors to it"):
         train(tiny, tmp_path / "parts")
-    (tmp_path / "parts" / FILE).unlink()
+    (tmp_path / "parts" / CHECKPOINT).unlink()
     reported = []
     train(tiny, tmp_path / "parts", report=reported.append)
     assert [entry.step for entry in reported] == [3, 4] and same_weights(
@@ -149,7 +149,7 @@ def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, t
 
 def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, monkeypatch):
     train(replace(tiny, steps=2), tmp_path)
-    before = {name: (tmp_path / name).read_bytes() for name in (FILE, "model.safetensors")}
+    before = {name: (tmp_path / name).read_bytes() for name in (CHECKPOINT, "model.safetensors")}
     monkeypatch.setattr(
         torch.optim.AdamW, "step", lambda self: self.param_groups[0]["params"][0].data.fill_(torch.inf)
     )
@@ -211,14 +211,14 @@ def test_a_run_interrupted_before_its_first_checkpoint_starts_again(tiny, tmp_pa
 
     with pytest.raises(KeyboardInterrupt):
         train(tiny, tmp_path, report=interrupt)
-    assert len(log_of(tmp_path)) == 1 and not (tmp_path / FILE).exists()
+    assert len(log_of(tmp_path)) == 1 and not (tmp_path / CHECKPOINT).exists()
     train(tiny, tmp_path)
     assert [entry["step"] for entry in log_of(tmp_path)] == [1, 2, 3, 4]
 
 
 def test_a_checkpoint_whose_values_do_not_fit_is_refused(tiny, tmp_path):
     train(replace(tiny, steps=1), tmp_path)
-    with safe_open(tmp_path / FILE, framework="pt") as file:
+    with safe_open(tmp_path / CHECKPOINT, framework="pt") as file:
         metadata = file.metadata()
         whole = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     moment = next(key for key in whole if key.startswith("optimizer/"))
@@ -230,7 +230,7 @@ def test_a_checkpoint_whose_values_do_not_fit_is_refused(tiny, tmp_path):
         (whole | {weight: torch.zeros(3, 3, 3)}, metadata),
         (whole, metadata | {"state": state}),
     ):
-        save_file(tensors, tmp_path / FILE, header)
+        save_file(tensors, tmp_path / CHECKPOINT, header)
         with pytest.raises(RunError, match="expected a run of this version"):
             train(replace(tiny, steps=2), tmp_path)
 
@@ -255,7 +255,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_saves_its_batch(tiny, tmp_pa
     saved = sorted((tmp_path / "not-finite-000000").iterdir())
     assert len(saved) == 1, "the buffer is empty at the first batch"
     assert sample_from_bytes(saved[0].read_bytes()).view.error.any()
-    assert not (tmp_path / FILE).exists()
+    assert not (tmp_path / CHECKPOINT).exists()
 
 
 def test_validation_scores_the_averaged_weights_and_writes_an_image(tiny, tmp_path):

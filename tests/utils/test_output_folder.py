@@ -122,7 +122,7 @@ def test_a_folder_in_which_nothing_was_made_is_gone(tmp_path):
 
 def test_files_that_change_are_known_by_their_names(tmp_path):
     with OutputFolder(tmp_path) as folder:
-        folder.made("log.jsonl", "shown-*.png", changing=True)
+        folder.record("log.jsonl", "shown-*.png", changing=True)
     for name in ("log.jsonl", "shown-3.png"):
         (tmp_path / name).write_text("anything")
     with OutputFolder(tmp_path) as folder:
@@ -136,7 +136,7 @@ def test_files_are_listed_once_they_are_made(tmp_path):
     with OutputFolder(tmp_path) as folder:
         assert not folder.listed
         (tmp_path / "report.md").write_text("a")
-        folder.made("report.*")
+        folder.record("report.*")
     with OutputFolder(tmp_path) as folder:
         assert folder.listed
         folder.check_own_files("report.*")

@@ -149,13 +149,13 @@ def report_folder(out: Path) -> "Iterator[None]":
     with OutputFolder(out) as folder:
         if folder.listed or not cells:  # a folder of cells without a manifest is of an early version
             folder.check_own_files(*WRITTEN)
-        folder.made(*WRITTEN, changing=True)  # a run that is killed leaves files that the next may replace
+        folder.record(*WRITTEN, changing=True)  # a run that is killed leaves files that the next may replace
         for place in ("cells", "sheets"):
             remove_partial_files(out / place)
         try:
             yield
         finally:
-            folder.made(*WRITTEN)
+            folder.record(*WRITTEN)
 
 
 def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Report":

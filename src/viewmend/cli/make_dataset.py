@@ -65,7 +65,7 @@ def run(options: Options) -> int:
 
     with OutputFolder(options.out) as folder:
         _make(options)
-        folder.made("shard-*.tar", PLAN, POSITION)
+        folder.record("shard-*.tar", PLAN, POSITION)
     return 0
 
 

@@ -194,11 +194,11 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
         file=path,
         folder=path.parent,
     )
-    return moved_to(calibration, _near_origin_m(calibration))
+    return moved_to(calibration, _origin_near_cameras_m(calibration))
 
 
-def _near_origin_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
-    """Round coordinates near the cameras; 0 if these are near enough to the origin for 32-bit numbers."""
+def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
+    """A point of round coordinates near the cameras; 0 if they are near enough to 0 for 32-bit numbers."""
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
     extent_m = float((centers_m.max(0) - centers_m.min(0)).max())
@@ -298,9 +298,11 @@ def _check_keys(content: dict[str, Any]) -> None:
             "format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it"
         )
     _check_spelling(content, _File.__struct_fields__)
-    for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
-        if isinstance(entry, dict):
-            _check_spelling(entry, _CameraEntry.__struct_fields__)
+    cameras = content.get("cameras")
+    if isinstance(cameras, list):
+        for entry in cameras:
+            if isinstance(entry, dict):
+                _check_spelling(entry, _CameraEntry.__struct_fields__)
 
 
 def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:

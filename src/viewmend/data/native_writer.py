@@ -47,12 +47,12 @@ def write_capture(
     of frames with masks but without a subject.
 
     Args:
-        source: a capture, a studio, or any other object with their attributes and `read`.
+        source: a capture, a studio, or any other `CaptureSource`.
         out: a new or empty folder.
         images: the format of the camera images.
         progress: wraps the frame indices while they are iterated over, as a progress bar does.
-        unmasked: returns the cameras of a frame, by its index, that the frame lacks because they
-            have no mask. Their images are written.
+        unmasked: returns, for the index of a frame, the cameras that were left out of it because
+            they have no mask; their images are written, too.
 
     Raises:
         CaptureError: `out` exists and is not empty, or the source cannot be read.
@@ -131,16 +131,19 @@ class _Writer:
         empty = []
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             for frame in prefetch(self.source, times):
-                rest = None if unmasked is None else unmasked(frame.time)
-                for part in (frame,) if rest is None else (frame, rest):
-                    list(
-                        pool.map(
-                            lambda view, part=part: self._write_view(part, view), range(len(part.cameras))
-                        )
-                    )
-                empty += [frame.time] if frame.mask is not None and not frame.has_subject else []
+                self._write_frame(frame, pool)
+                left_out = None if unmasked is None else unmasked(frame.time)
+                if left_out is not None:
+                    self._write_frame(left_out, pool)
+                if frame.mask is not None and not frame.has_subject:
+                    empty.append(frame.time)
         write_calibration(self.folder, self._calibration())
         return tuple(empty)
+
+    def _write_frame(self, frame: MultiViewFrame, pool: ThreadPoolExecutor) -> None:
+        """Write the images of all cameras of a frame, in parallel."""
+        written = pool.map(lambda view: self._write_view(frame, view), range(len(frame.cameras)))
+        list(written)  # waits, and raises their errors
 
     def _write_view(self, frame: MultiViewFrame, view: int) -> None:
         name = frame.cameras.names[view]

@@ -117,7 +117,7 @@ class VideoClock:
     """Cameras whose masks have other times, but as many frames as their images, and were matched
     one to one."""
     timecodes: str | None = None
-    """What the films' timecodes say of their starts, if these differ, and whether they were used."""
+    """A note if the films' timecodes give them different starts: how different, and whether they were used."""
 
     @property
     def fps(self) -> float | None:

@@ -151,7 +151,7 @@ class ViewOutputs(NamedTuple):
 
 
 class ExportedModel(nn.Module):
-    """`ViewSynthNet.step` of one view, without removing `remains_of_phantoms`."""
+    """`ViewSynthNet.step` of one view, without removing `artefact_islands`."""
 
     def __init__(self, net: ViewSynthNet) -> None:
         super().__init__()
@@ -166,7 +166,7 @@ class ExportedModel(nn.Module):
         guess = self._guess(view, sources)
         prediction = self.net(view, sources, where=where, guess=guess)
         fill = None if self.net.coarse is None else guess
-        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill, keep_remains=True)
+        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill, keep_islands=True)
         assert completed.confidence is not None, "the model predicts it"
         return tuple(
             ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth)

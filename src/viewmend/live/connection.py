@@ -45,7 +45,7 @@ async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
 
 @dataclass(frozen=True)
 class StateCauses:
-    """What a message `state` depends on. While none of this changes, no message is made."""
+    """What the message `state` is computed from. It is not computed again while this stays the same."""
 
     shared: SharedState
     clock_changes: int
@@ -54,9 +54,9 @@ class StateCauses:
 
 @dataclass(frozen=True)
 class UnpredictedState:
-    """The part of a message `state` that a page cannot compute from the last one.
+    """The part of the message `state` that a page cannot compute from the last one.
 
-    While it stays the same, no message is sent.
+    The message is not sent again while this stays the same.
     """
 
     source: dict[str, Any]
@@ -80,9 +80,9 @@ class SentMessages:
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     completed: int = 0
-    """`SharedState.completed` when messages `completed` were last sent."""
-    completed_of: dict[FrameKey, int] = field(default_factory=dict)
-    """The number of completed views that each frame had then."""
+    """`SharedState.completed` when completed views were last listed."""
+    listed_views: dict[FrameKey, int] = field(default_factory=dict)
+    """The number of completed views that were listed for each frame."""
 
 
 class ViewerConnection:
@@ -213,11 +213,11 @@ class ViewerConnection:
         if isinstance(message, Look) and message.codec not in codecs:
             raise ProtocolError(f"expected a codec among {codecs}, got '{message.codec}'")
         with self._service.lock:
-            session_uses = self._update_session(message)
-            extensions_use = [
+            handled_by_session = self._update_session(message)
+            handled_by_extension = [
                 extension.handle(self._session, message) for extension in self._registry.extensions
             ]
-            if not session_uses and not any(extensions_use):
+            if not handled_by_session and not any(handled_by_extension):
                 raise ProtocolError(
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
@@ -265,8 +265,8 @@ class ViewerConnection:
         now = self._now()
         self._send_new_rig()
 
-        # Two changes are not among the causes: a clock catches up with a live edge, or an extension
-        # has a new state.
+        # Two changes do not show in the causes: a clock catches up with the live edge, and an
+        # extension has a new state.
         catches_up = self._service.source.span.live and session.clock.playing and not session.clock.live
         changes_by_itself = bool(self._registry.extensions) or catches_up
         is_overdue = now - self._sent.state_s >= STATE_S
@@ -285,12 +285,10 @@ class ViewerConnection:
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
 
-        # If nothing changes by itself, the repeated state is due next. Otherwise the next check may
-        # find something to send.
+        # An idle viewer needs nothing before the state is repeated; others are checked again soon.
         gets_views = session.wants_views or session.in_flight is not None or session.sent_since(now - 2)
-        is_steady = self._sent.viewers == shared.viewers and not changes_by_itself and not gets_views
-        next_check_s = now
-        return self._sent.state_s + STATE_S if is_steady else next_check_s
+        is_idle = self._sent.viewers == shared.viewers and not changes_by_itself and not gets_views
+        return self._sent.state_s + STATE_S if is_idle else now
 
     def fail(self, error: Exception) -> None:
         """End the connection."""
@@ -316,17 +314,17 @@ class ViewerConnection:
             self._send_soon({"type": "state"} | causes.shared.source | own)
 
     def _send_completed(self) -> None:
-        """List what was made ahead of each frame that has more of it than before."""
+        """List what was made ahead for each frame that has more or less of it than was listed before."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
-            if self._sent.completed_of.get(key) != count:
+            if self._sent.listed_views.get(key) != count:
                 index, without = key
                 cameras = [image.camera for image in self._service.ahead.images(key)]
                 mesh = self._service.ahead.mesh(key) is not None
                 about = {"type": "completed", "time": index, "without": without}
                 message = about | {"cameras": cameras, "mesh": mesh}
                 self._send_soon(message, f"completed {key}")
-        self._sent.completed_of = counts
+        self._sent.listed_views = counts
 
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
@@ -354,7 +352,7 @@ class ViewerConnection:
 
     def _send_frame(self, message: bytes) -> None:
         def put() -> None:
-            self._send_new_rig()  # which is written before the frame
+            self._send_new_rig()  # queued messages are sent before the frame
             self._frame = message
             self._wake_writer.set()
 

@@ -310,7 +310,7 @@ class Inpainter:
         return cut(from_background(given, completed, view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
-        """Margin around the subject within which a crop of the view gives the same result as the whole view, pixels.
+        """Pixels of margin around the subject with which a crop gives the same result as the whole view.
 
         None: `step` needs the whole view.
         """

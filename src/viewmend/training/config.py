@@ -112,8 +112,8 @@ class ObjectiveConfig(ABC):
     """
 
     sampling: Annotated[SamplingConfig, HIDDEN]
-    objective: ClassVar[Callable[..., Any]]
-    """The class of the `Objective`, called with a `TrainConfig`, this config, and the model to
+    objective_class: ClassVar[Callable[..., Any]]
+    """The `Objective` to train; called with a `TrainConfig`, this config, and the model to
     start from or None."""
     item: ClassVar[type]
     """Class of the items of `make_scenes`."""

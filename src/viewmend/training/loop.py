@@ -18,8 +18,8 @@ from viewmend.training.held_back import PATIENCE, HeldBackValidation, is_better
 from viewmend.training.objective import StepOutput
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import (
-    FILE,
-    PREVIOUS,
+    CHECKPOINT,
+    PREVIOUS_CHECKPOINT,
     Log,
     Progress,
     RunState,
@@ -98,8 +98,9 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
-        folder.made(FILE, PREVIOUS, *WRITTEN_FILES, *WRITTEN_FOLDERS, *in_folders, changing=True)
+        names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
+        files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
+        folder.record(*names, *files_in_folders, changing=True)
         yield
 
 
@@ -124,10 +125,9 @@ class Processes:
         return Ddp(module, device_ids=devices, find_unused_parameters=True)
 
     def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
-        """The positions of the streams of all processes, by the stream's number.
+        """The positions of the streams of all processes, in the order of the streams' numbers.
 
-        Stream n belongs to process n % count, so the first streams of all processes come first,
-        then their second ones.
+        Stream n belongs to process n % count.
         """
         own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
         if self.count == 1:
@@ -204,8 +204,8 @@ class RunClock:
         """Whether `checkpoint_minutes` have passed since the last checkpoint."""
         return time.monotonic() - self._saved >= 60 * self.config.checkpoint_minutes
 
-    def saved(self) -> None:
-        """A checkpoint was written."""
+    def note_checkpoint(self) -> None:
+        """Note that a checkpoint was written now."""
         self._saved = time.monotonic()
 
     @contextmanager
@@ -239,9 +239,9 @@ class Run:
         self.config = config
         self.out = out
         self.processes = processes
-        make_objective = config.objective.objective
+        objective_class = config.objective.objective_class
         run_config = _with_precision(config, processes.device)
-        self.objective = make_objective(run_config, config.objective, start).to(processes.device)
+        self.objective = objective_class(run_config, config.objective, start).to(processes.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
@@ -277,14 +277,12 @@ class Run:
             if step == 0 and self.validation is not None and compares_start:
                 self._validate(log, step)
             while True:
-                progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
-                # The checkpoint holds the best score. It must not be older than the best weights: a
-                # resumed run would not know their score, and would replace them by worse ones.
-                due = step > self.state.step and (
-                    clock.checkpoint_due() or self.state.best_step > self.state.step
+                ends_now = stopped() or self._has_stopped_improving(step)
+                own_progress = 1.0 if ends_now else clock.progress(step)
+                progress, checkpoint_due = self.processes.maximum(
+                    own_progress, float(self._checkpoint_due(step, clock))
                 )
-                progress, due = self.processes.maximum(progress, float(due))
-                if due:
+                if checkpoint_due:
                     self._save(step, clock)
                 if progress >= 1:
                     break
@@ -306,7 +304,8 @@ class Run:
             if step > self.state.step:
                 self._save(step, clock)
             elif self.processes.first and not self.keeps_best:
-                self._write_model()  # the run was finished before; the model's file may be lost
+                self._write_model()  # the run was complete already, but its model may have been removed
+            # The last steps are validated, unless the loop has just done so.
             if self.validation is not None and step > first and step % config.validate_every:
                 self._validate(log, step)
 
@@ -316,7 +315,7 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Log the scores of the averaged weights; a run that keeps the best weights writes them if these are better."""
+        """Score and log the averaged weights; write them if they are the best of a run that keeps the best."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
@@ -330,8 +329,18 @@ class Run:
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(step)
 
-    def _is_done(self, step: int) -> bool:
-        """Whether a run that keeps the best weights has not found better ones for `PATIENCE` validations."""
+    def _checkpoint_due(self, step: int, clock: RunClock) -> bool:
+        """Whether to write a checkpoint: some time after the last one, and at once after better weights were kept.
+
+        The checkpoint holds the score of the best weights. A run that resumed from an older one could
+        replace them by worse ones.
+        """
+        has_new_steps = step > self.state.step
+        has_better_weights = self.state.best_step > self.state.step
+        return has_new_steps and (has_better_weights or clock.checkpoint_due())
+
+    def _has_stopped_improving(self, step: int) -> bool:
+        """Whether a run that keeps the best weights found no better ones in the last `PATIENCE` validations."""
         waited = step - self.state.best_step
         return self.processes.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
 
@@ -348,7 +357,7 @@ class Run:
             for piece in self._split(batch):
                 share = len(piece) / count
                 done += len(piece)
-                # Gradients accumulate here; they meet those of other processes in the last backward pass.
+                # Gradients accumulate; only the last backward pass averages them over the processes.
                 is_last = done == count
                 with nullcontext() if is_last else self._without_sync():
                     samples = [to_device(sample, self.processes.device) for sample in piece]
@@ -441,7 +450,7 @@ class Run:
             save_run(self.out, self.config, self.state, self._modules, self._optimizers)
             if not self.keeps_best:
                 self._write_model()
-        clock.saved()
+        clock.note_checkpoint()
 
     def _write_model(self, step: int | None = None) -> None:
         state = self.state if step is None else replace(self.state, step=step)

@@ -16,9 +16,9 @@ from viewmend.training.replay import ReplayPosition
 from viewmend.utils.atomic_writes import TEMPORARY, name_path_in_errors, write_tensors, write_text
 from viewmend.utils.untrusted_input import InputError
 
-FILE = "run.safetensors"
+CHECKPOINT = "run.safetensors"
 """The last checkpoint has this name."""
-PREVIOUS = "run.previous.safetensors"
+PREVIOUS_CHECKPOINT = "run.previous.safetensors"
 """The checkpoint before the last has this name."""
 MAY_CHANGE = (
     "steps",
@@ -85,16 +85,16 @@ def save_run(
         for number, values in optimizer.state_dict()["state"].items():
             tensors |= {f"{name}/{number}/{key}": torch.as_tensor(value) for key, value in values.items()}
     metadata = {"state": json.dumps(asdict(state)), "config": json.dumps(_flat(config))}
-    unfinished = folder / f"{TEMPORARY}{FILE}"
+    unfinished = folder / f"{TEMPORARY}{CHECKPOINT}"
     write_tensors(unfinished, tensors, metadata)
-    if (folder / FILE).exists():
-        (folder / FILE).replace(folder / PREVIOUS)
-    unfinished.replace(folder / FILE)
+    if (folder / CHECKPOINT).exists():
+        (folder / CHECKPOINT).replace(folder / PREVIOUS_CHECKPOINT)
+    unfinished.replace(folder / CHECKPOINT)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint in a run's folder; None if there is none."""
-    return next((folder / name for name in (FILE, PREVIOUS) if (folder / name).exists()), None)
+    return next((folder / name for name in (CHECKPOINT, PREVIOUS_CHECKPOINT) if (folder / name).exists()), None)
 
 
 def load_run(
@@ -142,9 +142,9 @@ def load_run(
 
 
 def _advice(path: Path) -> str:
-    if path.name == FILE and path.with_name(PREVIOUS).exists():
+    if path.name == CHECKPOINT and path.with_name(PREVIOUS_CHECKPOINT).exists():
         return (
-            f"remove the file to start again, or rename {PREVIOUS} to it to resume from the checkpoint before"
+            f"remove the file to start again, or rename {PREVIOUS_CHECKPOINT} to it to resume from the checkpoint before"
         )
     return "remove the file to start again"
 

@@ -101,7 +101,7 @@ class OutputFolder:
                     "added or changed since; move it away, or choose another folder"
                 )
 
-    def made(self, *patterns: str, changing: bool = False) -> None:
+    def record(self, *patterns: str, changing: bool = False) -> None:
         """Record files in the manifest, by hash; with `changing`, by pattern only, before they exist.
 
         A pattern that was recorded as changing is replaced by the hashes of its files when recorded again.

@@ -1,4 +1,4 @@
-"""Exported models keep the remains of phantoms, so the model that they are compared with keeps them, too."""
+"""Exported models keep the islands of hull artefacts, so the model that they are compared with keeps them, too."""
 
 import pytest
 import torch
@@ -9,5 +9,5 @@ from viewmend.models.views import prediction
 @pytest.fixture(autouse=True)
 def remains_stay(monkeypatch):
     monkeypatch.setattr(
-        prediction, "remains_of_phantoms", lambda colour, alpha, predicted: torch.zeros_like(predicted)
+        prediction, "artefact_islands", lambda colour, alpha, predicted: torch.zeros_like(predicted)
     )

@@ -12,8 +12,8 @@ ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""
 PHASE_GAIN = 0.05
 """Each group moves the ticks by this fraction of its cameras' median offset."""
-ALL_WANTED_RATIO = 1.5
-"""A camera is fast if it takes at least this many images per tick. Not all of its images are used."""
+FAST_RATIO = 1.5
+"""A camera is fast if it takes at least this many images per tick; only those nearest to a tick are used."""
 MAX_COMPLETE = 4
 """This many complete groups are kept until they are taken; the oldest are dropped."""
 
@@ -42,12 +42,12 @@ class ImageGroup:
 
 
 @dataclass(frozen=True)
-class Tick:
-    """The tick that is nearest to a time."""
+class NearestTick:
+    """The tick nearest to some time."""
 
     number: int
     offset_s: float
-    """The time, relative to the tick."""
+    """That time minus the tick's."""
 
 
 class Aligner:
@@ -79,16 +79,16 @@ class Aligner:
 
         `period_s` is the time between two images of the camera.
         """
-        if self._interval_s < ALL_WANTED_RATIO * period_s:
+        if self._interval_s < FAST_RATIO * period_s:
             return True
         return abs(self._nearest(taken_s).offset_s) <= period_s / 2
 
-    def _nearest(self, taken_s: float) -> Tick:
+    def _nearest(self, taken_s: float) -> NearestTick:
         """The tick nearest to a time; the first call sets tick 0."""
         if self._origin_s is None:
             self._origin_s = taken_s
         number = math.floor((taken_s - self._origin_s) / self._interval_s + 0.5)
-        return Tick(number, taken_s - self._origin_s - number * self._interval_s)
+        return NearestTick(number, taken_s - self._origin_s - number * self._interval_s)
 
     def put(self, name: str, timed: TimedImages, now_s: float) -> None:
         """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""

@@ -28,9 +28,9 @@ SILENT_S = 1.0
 """A stream that sends nothing for this many seconds is opened again."""
 LATE_S = 0.1
 """Images of a recording that are overdue by this many seconds are skipped."""
-WAITED_S = 0.002
-"""A packet for which the reader waited longer than this many seconds was not in a queue. So the time
-of its arrival is known."""
+MIN_WAIT_S = 0.002
+"""If the reader waited longer than this for a packet, in seconds, the packet has just arrived;
+otherwise it may have been in a queue."""
 DAMAGED_S = 2.0
 """Images after a damaged one are dropped until the next key frame, but no longer than this many seconds."""
 FFMPEG_OPTIONS = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
@@ -66,11 +66,11 @@ class Playback:
         self.length_s = length_s
         """The length of a lap, after which all recordings start again: that of the shortest recording."""
         self.shifts_s: dict[str, float] = {}
-        """Seconds to add to the times in a camera's recording. The first image of all of them is then
+        """Seconds to add to the times in each camera's recording, so that the earliest image of all is
         at 0. A recording that is not listed is played alone, from its first image."""
 
     def follow(self, tracks: Sequence[Track]) -> str | None:
-        """Play these recordings by their own times. Returns what their timecodes say of their starts, if these differ.
+        """Play these recordings by their own times. Returns a note if their timecodes give them different starts.
 
         Raises:
             ValueError: no two of them show the same time.
@@ -123,7 +123,7 @@ def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Pic
             if packet is None or packet.size == 0:
                 raise OSError("the stream has ended")
             arrived_s = time.monotonic()
-            times.add_packet(packet, arrived_s, arrived_s - asked_s > WAITED_S)
+            times.add_packet(packet, arrived_s, waited=arrived_s - asked_s > MIN_WAIT_S)
             try:
                 frames = packet.decode()
             except av.InvalidDataError:

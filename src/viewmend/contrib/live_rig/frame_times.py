@@ -50,17 +50,17 @@ class SenderTimes(ArrivalTimes):
         super().__init__()
         self._clock = SenderClock()
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """Arrivals of the last packets, which FFmpeg still delays; None for one from a queue, whose
-        arrival is unknown."""
+        """When the reader received the last packets; None for one that was in a queue. FFmpeg lags
+        `lag_packets` behind, so the newest packet's data arrived at the first of these times."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ArrivalTimes.add_packet`."""
         self._arrivals_s.append(arrived_s if waited else None)
         if len(self._arrivals_s) < (self._arrivals_s.maxlen or 0):
             return
-        own_arrival_s = self._arrivals_s[0]
-        if own_arrival_s is not None and packet.dts is not None and packet.time_base is not None:
-            self._clock.add_packet(float(packet.dts * packet.time_base), own_arrival_s)
+        data_arrived_s = self._arrivals_s[0]
+        if data_arrived_s is not None and packet.dts is not None and packet.time_base is not None:
+            self._clock.add_packet(float(packet.dts * packet.time_base), data_arrived_s)
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
         """See `ArrivalTimes.taken_s`."""

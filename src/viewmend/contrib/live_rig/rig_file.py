@@ -149,13 +149,14 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     if unknown:
         expected = f"expected cameras that {calibration.file} has ({', '.join(known)})"
         raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
+    half_interval_s = 0.5 / rig.fps
     return LiveRig(
         name=rig.name or folder.name,
         cameras=tuple(
             _camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras
         ),
         fps=rig.fps,
-        tolerance_s=(rig.tolerance_ms or 500 / rig.fps) / 1000,
+        tolerance_s=half_interval_s if rig.tolerance_ms is None else rig.tolerance_ms / 1000,
         wait_s=rig.wait_ms / 1000,
         up=calibration.up,
         bounds_m=calibration.bounds_m,
@@ -166,13 +167,13 @@ def _calibration(place: Path, format: str | None) -> NativeCalibration:
     """The calibration of a folder of any format, or of a file in one.
 
     Raises:
-        CaptureError: there is none, or `place` is a file and the readers would use another one next to it.
+        CaptureError: there is none, or the readers would use another file of the folder than `place`.
     """
     if not place.is_file():
         return read_any_calibration(place, format)
     found = read_any_calibration(place.parent, format)
-    is_other_file = found.file.resolve() != place.resolve() and found.file.suffix == place.suffix
-    if is_other_file and format is None:
+    uses_other_file = found.file.resolve() != place.resolve() and found.file.suffix == place.suffix
+    if uses_other_file and format is None:
         raise CaptureError(
             f"{place}: expected the folder's calibration, which is {found.file.name}; name the format"
         )

@@ -84,7 +84,7 @@ class RigFileSource(LiveSource):
         self._cameras_lock = threading.Condition()
         self._playback = Playback()
         self._aligner = Aligner(names=(), interval_s=1.0, tolerance_s=1.0, wait_s=1.0)
-        """No camera's images, until `_switch_to` replaces it."""
+        """A placeholder without cameras, until `_switch_to` replaces it."""
         self._workers: dict[str, CameraWorker] = {}
         self._new_workers: list[CameraWorker] = []
         """Workers that `_begin_rig` starts."""

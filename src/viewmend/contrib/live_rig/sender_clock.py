@@ -4,8 +4,8 @@ from collections import deque
 from dataclasses import dataclass
 
 WINDOW_S = 10.0
-"""The least delayed packet of the last this many seconds sets the clock. Clocks drift apart by less
-than 1 ms in that time."""
+"""The clock is set by the least delayed packet of a window of this many seconds, in which clocks
+drift apart by less than 1 ms."""
 JUMP_S = 1.0
 """A sender has restarted if its timestamps go back by more than this many seconds, or forward by this
 much more than the elapsed time."""

@@ -20,21 +20,21 @@ CELL_PX = 2
 """Depth hypotheses are judged in square cells of this side, pixels."""
 TILE_PX = 32
 """The tiles of `run_tiled` have this side, pixels; it is a multiple of a cell's."""
-AT_ONCE = (8, 4, 2, 1)
-"""Tiles pass the layers in groups of these sizes: a few sizes, because convolutions are compiled for each."""
+TILES_AT_ONCE = (8, 4, 2, 1)
+"""Tiles pass the layers in groups of these sizes. They are few, because convolutions are compiled for each."""
 BAND_PX = (3, 7)
-"""Means over squares of these sides separate the bands of detail, pixels of a view that shows the
-subject as large as the source cameras do."""
+"""The bands of detail are separated by means over squares of these sides, in pixels, in a view that
+shows the subject as large as the source cameras do."""
 MAX_MAGNIFICATION = 8.0
 """The squares grow with a view's magnification up to this factor."""
-WIDER = 16
+WIDTH_STEP = 16
 """The U-Net adds this many channels at each coarser scale."""
 
 
 def downsample2x(view: IncompleteView) -> IncompleteView:
     """The view at half its resolution: means over the covered pixels of each cell, at their nearest depth.
 
-    All that the proxy covers becomes E.
+    E is 1 wherever the proxy covers the cell.
     """
     height, width = view.mask.shape
     right = width % 2
@@ -105,8 +105,8 @@ def detail_bands(
 ) -> Float[Tensor, "pixel band image 3"]:
     """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
 
-    Bands follow the sampling of the source cameras. In a magnified view, what differs from its mean over three pixels
-    is mostly where neighbouring pixels were sampled in different cameras: added as detail, it would show as specks.
+    The squares grow with the magnification. The finest band of a magnified view would otherwise show where
+    neighbouring pixels were sampled in different cameras: as specks.
 
     Args:
         colours: the images' colours at the pixels.
@@ -129,7 +129,7 @@ def detail_bands(
 
 
 def band_sides_px(magnification: float | Float[Tensor, ""]) -> tuple[int | Int[Tensor, ""], ...]:
-    """The sides of the squares around whose means there is detail: the largest odd numbers of pixels that fit."""
+    """`BAND_PX` in a magnified view, rounded down to odd numbers of pixels."""
     if isinstance(magnification, Tensor):
         factors = magnification.clamp(1.0, MAX_MAGNIFICATION)
         return tuple(2 * ((factors * side - 1) / 2).long() + 1 for side in BAND_PX)
@@ -167,7 +167,7 @@ def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "r
 def concatenate_channels(
     *images: Shaped[Tensor, "_channel rows columns"],
 ) -> Shaped[Tensor, "1 channel rows columns"]:
-    """Images in one batch of one, channels last in memory as `scatter_to_image` has them: nothing is transposed."""
+    """The channels of all images as a batch of one. Memory is channels-last, as `scatter_to_image` returns it."""
     return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
 
 
@@ -176,7 +176,7 @@ def crop_to(
 ) -> Float[Tensor, "channel height width"]:
     """The first rows and columns of an image.
 
-    `torch.export` would assume that a slice cuts off none, or some; so they are gathered while it traces.
+    While `torch.export` traces, indices are gathered instead: a slice would fix whether anything is cut off.
     """
     if torch.compiler.is_exporting():
         rows, columns = (torch.arange(length, device=image.device) for length in shape)
@@ -189,7 +189,7 @@ class UNet(nn.Module):
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()
-        widths = tuple(width + WIDER * scale for scale in range(4))
+        widths = tuple(width + WIDTH_STEP * scale for scale in range(4))
         self.enter = nn.Conv2d(channels, width, 1)
         self.first = nn.Sequential(
             nn.Conv2d(width, width, 3, padding=1),
@@ -220,9 +220,9 @@ class UNet(nn.Module):
         at: Int[Tensor, "point 2"],
         image: Float[Tensor, "1 other_channel height width"],
     ) -> Float[Tensor, "1 feature height width"]:
-        """`forward` of an image whose first channels are `values` at rows and columns, and zeros elsewhere.
+        """`forward` of `image` after some first channels, which are `values` at the points and 0 elsewhere.
 
-        The first layer has a kernel of one pixel, so it runs on those channels at the points only.
+        The first layer has a kernel of one pixel, so it runs on the first channels at the points only.
         """
         weight = self.enter.weight
         first_channels = values.shape[1]
@@ -258,8 +258,8 @@ def run_tiled(
     bilinearly; the others are `values` at the pixels, else zeros. The layers are convolutions of
     odd kernels that keep the size, and layers that act on single pixels.
     """
-    halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
     # The tiles that contain a pixel
+    halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
     across = -(-shape[1] // TILE_PX)
     tile_of_pixel = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
     tiles, own = tile_of_pixel.unique(return_inverse=True)
@@ -277,7 +277,7 @@ def run_tiled(
     first = 0
     while first < len(tiles):
         stop_if_cancelled()
-        size = next(size for size in AT_ONCE if size <= len(tiles) - first)
+        size = next(size for size in TILES_AT_ONCE if size <= len(tiles) - first)
         rows = tile_rows[first : first + size]
         columns = tile_columns[first : first + size]
         upsampled = _upsample_windows(cell_values[cell_windows[rows, columns]], halo).to(values)
@@ -304,11 +304,11 @@ def _value_windows(
 def _cell_windows(
     cells: Float[Tensor, "1 feature rows columns"], halo: int
 ) -> Int[Tensor, "tile_row tile_column height width"]:
-    """The number of each cell of each tile with its halo; cells beyond the border are those on it."""
+    """The index of each cell of each tile with its halo; beyond the border, that of the nearest cell."""
     grid = cells.shape[2:]
-    numbers = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
+    index = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
     frame = _frame(grid, _cell_halo(halo), TILE_PX // CELL_PX)
-    padded = F.pad(numbers, frame, mode="replicate").long()
+    padded = F.pad(index, frame, mode="replicate").long()
     return _windows(padded[0], _cell_halo(halo), TILE_PX // CELL_PX)[0]
 
 
@@ -359,15 +359,15 @@ def _inside(
 
 
 def _run_unpadded(layers: nn.Sequential, x: Tensor, inside: Tensor | None) -> Tensor:
-    """The layers without padding; what is not `inside` the image is 0 before each convolution."""
+    """The layers without padding; pixels that are not `inside` the image are 0 before each convolution."""
     x = x if inside is None else x * inside
     for layer in layers:
         if not isinstance(layer, nn.Conv2d):
             x = layer(x)
             continue
         x = F.conv2d(x, layer.weight, layer.bias)
-        lost = layer.kernel_size[0] // 2
-        if inside is not None and lost:
-            inside = inside[:, :, lost:-lost, lost:-lost]
+        border = layer.kernel_size[0] // 2
+        if inside is not None and border:
+            inside = inside[:, :, border:-border, border:-border]
         x = x if inside is None else x * inside
     return x

@@ -2,12 +2,13 @@
 
     source cameras -> ray samples -> aggregation -> depth distribution -> blending -> prediction
 
-At half the resolution, the image consists of cells of 2 x 2 pixels with one ray each. Samples at
-fixed offsets behind the proxy are taken along every ray, from the source cameras that see it best,
-and aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as
-networks on cost volumes do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the
-depth found, and blended. Blending softens the image, so detail
-is added: in each of two frequency bands, the network takes it from the blended colours, from one
+At half the resolution, each cell of 2 x 2 pixels has one ray, with samples at fixed offsets behind
+the proxy (the surface of the visual hull). The source cameras that see a ray best are sampled there
+and aggregated. A U-Net over the view turns the samples into a distribution over depths, as networks
+on cost volumes do (MVSNet, ENeRF).
+
+At full resolution, the cameras are sampled again at the depth found, and blended. Blending softens
+the image, so detail is added in two frequency bands. It is taken from the blended colours, from one
 camera and from the rendered view, with learned gains for every pixel.
 """
 
@@ -61,28 +62,27 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
-"""The cameras of a cell are those with the largest initial weights at these z-depths behind the
-proxy, in subject sizes."""
+"""A ray's cameras are chosen by what they see at these z-depths behind the proxy, in subject sizes."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """A cell of the U-Net has the channels of `ViewImage`, its relative depth, and whether it has a depth."""
-CANDIDATES = 4
+NUM_CANDIDATES = 4
 """A pixel blends this many colours: those in `CandidateColours`."""
-DETAILS = 3 * len(BAND_PX)
-"""A pixel has this many gains of detail. Each band has three: for the blended colours, for the most
-trusted camera, and for the guess."""
+NUM_GAINS = 3 * len(BAND_PX)
+"""A pixel's detail is multiplied by this many gains: three per band, for the blended colours, the
+most trusted camera and the guess."""
 INITIAL_GAIN = 0.3
-"""The gain of the finest detail of the blended colours before training."""
+"""Before training, the blended colours have this gain in the finest band; all other gains are 0."""
 PIXEL_CHANNELS = 27
 """`pixel_inputs` has this many channels. The last convolutions also get features of the U-Net and
 of the pixel's sample."""
-OUTPUT_CHANNELS = (CANDIDATES, 1, 1, DETAILS)
-"""The last convolutions give a score for each candidate colour, alpha, confidence, and gains of detail."""
+OUTPUT_CHANNELS = (NUM_CANDIDATES, 1, 1, NUM_GAINS)
+"""The last convolutions return scores of the candidate colours, alpha, confidence, and gains of detail."""
 ALPHA_SLOPE = 4.0
 """The cameras' mean mask, minus 0.5, is multiplied by this factor and added to the logit of alpha."""
 MIN_DETAIL_WEIGHT = 0.01
 """Detail is the difference from a local mean, in which every pixel has at least this weight."""
 MARGIN_PX = 16
-"""A crop with this margin around the subject gives the same prediction as the whole view, pixels."""
+"""A crop with a margin of this many pixels around the subject gives the same prediction as the whole view."""
 
 
 class ViewImage(NamedTuple):
@@ -97,7 +97,7 @@ class ViewImage(NamedTuple):
     largest_weight: Float[Tensor, "height width"]
     """The largest weight of a source camera in the pixel's colour."""
     predicted: Float[Tensor, "height width"]
-    """1 where the pixel is predicted."""
+    """1 where the pixel is to be predicted."""
 
     @classmethod
     def of(cls, view: IncompleteView, guess: Image, predicted: Mask) -> "ViewImage":
@@ -123,7 +123,7 @@ class CandidateColours(NamedTuple):
     guess: Float[Tensor, "pixel 3"]
     """The rendered view, or the coarse guess in holes."""
     soft_mask: Float[Tensor, "pixel 1"]
-    """The mask that belongs to `soft`, which the last convolutions get too."""
+    """The mean mask, interpolated as `soft` is; an input of the last convolutions."""
 
     def stacked(self) -> Float[Tensor, "pixel 4 3"]:
         """The colours, in the order of their scores."""
@@ -162,14 +162,14 @@ class ViewSynthNet(Network):
         fine = config.fine_features
         last = nn.Conv2d(fine, sum(OUTPUT_CHANNELS), 3, padding=1)
 
-        # Before training, the only detail is the finest of the blended colours: the first gain is not 0
-        gains = slice(-DETAILS, None)
-        first_gain = -DETAILS
+        # All gains of detail begin at 0, except that of the blended colours in the finest band
+        all_gains = slice(-NUM_GAINS, None)
+        finest_blended = -NUM_GAINS
         with torch.no_grad():
             assert last.bias is not None
-            last.weight[gains] = 0
-            last.bias[gains] = 0
-            last.bias[first_gain] = INITIAL_GAIN
+            last.weight[all_gains] = 0
+            last.bias[all_gains] = 0
+            last.bias[finest_blended] = INITIAL_GAIN
         self.blending = nn.Sequential(
             nn.Conv2d(inputs, fine, 3, padding=1),
             nn.ReLU(),
@@ -245,14 +245,15 @@ class ViewSynthNet(Network):
         pixels = torch.nonzero(predicted)
         surface = surface_points(view.depth, scale, pixels, distribution)
         found = torch.stack([surface.depth, surface.probability], 1)
-        return DepthMap(*scatter_to_image(found, pixels, view.mask.shape))
+        depth, confidence = scatter_to_image(found, pixels, view.mask.shape)
+        return DepthMap(depth, confidence)
 
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
         """Computes the image pyramids of these cameras."""
         SourceCameras.of(views, None, context)
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
-        """The margin around the subject with which a crop is predicted as the whole view is, pixels."""
+        """See `Inpainter.crop_margin_px`."""
         return MARGIN_PX
 
     @torch.no_grad()
@@ -284,11 +285,11 @@ class ViewSynthNet(Network):
             return fallback_view(view, fades), state
 
         # Otherwise, the subject or a part of it is predicted
-        quick = fraction is not None
-        guess = self.coarse_guess(view, sources, quick)
-        filled_by_rays = self.coarse is not None and not quick
+        reduced_quality = fraction is not None
+        guess = self.coarse_guess(view, sources, quick=reduced_quality)
+        ray_fill = None if self.coarse is None or reduced_quality else guess
         prediction = self(view, sources, where=where, guess=guess)
-        completed = prediction.composite_into(view, where, fades, guess if filled_by_rays else None)
+        completed = prediction.composite_into(view, where, fades, ray_fill)
         completed, last = steady(completed, where, state)
         return opaque_in_mask(completed), last
 
@@ -302,20 +303,21 @@ class ViewSynthNet(Network):
     ) -> DepthDistribution:
         """Samples the cameras on the rays of all cells, and judges the samples by a U-Net over the view."""
         # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
-        depth = nearest_depth(view.depth * predicted)
-        cells = torch.nonzero(depth > 0)
+        predicted_depth = nearest_depth(view.depth * predicted)
+        cells = torch.nonzero(predicted_depth > 0)
         rows, columns = cells.unbind(1)
-        proxy_z = depth[rows, columns][:, None]
+        proxy_z = predicted_depth[rows, columns][:, None]
         uv_px = CELL_PX * (cells.flip(1).double() + 0.5)
-        choosing_rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(CHOOSING_OFFSETS))
-        cameras = choose_cameras(choosing_rays, sources, RAY_VIEWS)
-        rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * depth.new_tensor(OFFSETS), cameras)
+        choosing_z = proxy_z + scale.size_m * proxy_z.new_tensor(CHOOSING_OFFSETS)
+        cameras = choose_cameras(Rays(view, scale, uv_px, choosing_z), sources, RAY_VIEWS)
+        rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * proxy_z.new_tensor(OFFSETS), cameras)
 
         # Further inputs of the U-Net, in all cells: the rendered view, and the depth of the proxy
-        front = nearest_depth(view.depth)
-        relative = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        proxy_depth = nearest_depth(view.depth)
+        on_proxy = proxy_depth > 0
+        relative = torch.where(on_proxy, ((proxy_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
-        cell_channels = torch.cat([means, relative[None], (front > 0)[None].to(means)])
+        cell_channels = torch.cat([means, relative[None], on_proxy[None].to(means)])
 
         # Scores of the hypotheses: one from each sample alone, and one from its neighbourhood
         with self.autocast():
@@ -327,12 +329,11 @@ class ViewSynthNet(Network):
                     inputs, cells, concatenate_channels(cell_channels.to(inputs))
                 )
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
-        return DepthDistribution(
-            cells, index_image(cells, depth.shape), depth, logits, samples, cameras, features
-        )
+        cell_index = index_image(cells, predicted_depth.shape)
+        return DepthDistribution(cells, cell_index, predicted_depth, logits, samples, cameras, features)
 
     def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
-        """The aggregated samples of the rays of cells, chunk by chunk."""
+        """The aggregated samples of the rays of cells, computed in chunks."""
         parts = []
         for chunk in rays.split(sources.rays_at_once):
             stop_if_cancelled()
@@ -350,7 +351,7 @@ class ViewSynthNet(Network):
         distribution: DepthDistribution,
     ) -> ViewPrediction:
         """Samples the cameras on the surface that each pixel shows, and blends them."""
-        # Sample the cameras at the depth found
+        # Sample the cameras at the depth found: each pixel's ray has one sample, with index 0
         stop_if_cancelled()
         surface = surface_points(view.depth, scale, pixels, distribution)
         cameras = None if distribution.cameras is None else distribution.cameras[surface.cell]
@@ -392,7 +393,7 @@ class ViewSynthNet(Network):
     def _aggregate_pixels(
         self, samples: RaySamples, surface: SurfacePoints, distribution: DepthDistribution
     ) -> AggregatedSamples:
-        """Weighs the cameras at each pixel. Their initial weights are those that they have in its cell."""
+        """Weighs the cameras at each pixel. The weights that its cell gave them are the initial ones."""
         prior = distribution.samples.trust[surface.cell, surface.hypothesis]
         with self.autocast():
             return self.pixel_aggregator(samples, prior[:, None])
@@ -433,7 +434,7 @@ def amplify_detail(
 
 
 def candidate_colours(
-    cameras: Float[Tensor, "pixel view feature"],
+    features: Float[Tensor, "pixel view feature"],
     aggregated: AggregatedSamples,
     image: ViewImage,
     pixels: Pixels,
@@ -442,7 +443,7 @@ def candidate_colours(
     """The colours that each pixel may have.
 
     Args:
-        cameras: features of each pixel's sample on the surface in every camera.
+        features: what every camera shows of each pixel's sample on the surface.
         aggregated: these samples after aggregation over cameras.
         image: the rendered view.
         pixels: row and column of each pixel.
@@ -451,7 +452,7 @@ def candidate_colours(
     # On the surface: all cameras by their trust, and the most trusted one alone
     trusted = unpremultiply(aggregated.colour[:, 0], aggregated.mask[:, 0])
     best = aggregated.trust[:, 0].argmax(1)
-    best_features = cameras.gather(1, best[:, None, None].expand(-1, 1, FEATURES))[:, 0]
+    best_features = features.gather(1, best[:, None, None].expand(-1, 1, FEATURES))[:, 0]
     single = unpremultiply(best_features[:, COLOUR], best_features[:, MASK])
 
     # On the whole ray: the mean over depth hypotheses
@@ -476,7 +477,7 @@ def pixel_inputs(
 ) -> Float[Tensor, "pixel 27"]:
     """Colours, masks and statistics of each pixel: inputs of the last convolutions.
 
-    Shipped weights depend on their order. `mask` is the cameras' mean mask on the surface, and
+    Their order is that of the shipped weights. `mask` is the cameras' mean mask on the surface, and
     `statistics` are those of the sample there.
     """
     rows, columns = pixels.unbind(1)

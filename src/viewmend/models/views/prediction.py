@@ -22,7 +22,7 @@ Image = Float[Tensor, "3 height width"]
 Mask = Bool[Tensor, "height width"]
 MIN_MASK = 0.1
 """Colours on black are divided by their mask, but by no less than this."""
-HOLE_GUESS = 0.7
+RAY_FILL_SHARE = 0.7
 """The colour of a hole takes this share from `RayFill`, and the rest from `ViewSynthNet`, which saw
 few holes in training."""
 SAME_SURFACE = 0.03
@@ -32,7 +32,7 @@ subject sizes."""
 
 @dataclass(frozen=True)
 class IslandRule:
-    """Which islands around the subject are remains of a hull artefact that was mostly recognised as one."""
+    """Which islands around the subject are remains of a hull artefact, most of which the model made transparent."""
 
     visible: float = 1 / 16
     """A pixel belongs to an island if its alpha or its colour is above this."""
@@ -64,7 +64,7 @@ class DepthDistribution(NamedTuple):
     def interpolate(
         self, values: Float[Tensor, "cell channel"], pixels: Pixels
     ) -> Float[Tensor, "pixel channel"]:
-        """The cells' values at pixels (row, column), bilinearly between existing cells."""
+        """The cells' values at pixels (row, column), interpolated bilinearly between existing cells."""
         weighted = F.pad(values, (0, 1), value=1.0)
         padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
 
@@ -118,7 +118,7 @@ class ViewPrediction(NamedTuple):
         predicted: Mask,
         fades: Mask,
         fill: Image | None = None,
-        keep_remains: bool = False,
+        keep_islands: bool = False,
     ) -> CompletedView:
         """The rendered view with this prediction: Fhat = E Ftilde + (1 - E) F.
 
@@ -127,7 +127,7 @@ class ViewPrediction(NamedTuple):
             predicted: the pixels of this prediction.
             fades: pixels that are partly background, which are attenuated by E.
             fill: the output of `RayFill`, to blend into holes.
-            keep_remains: whether `remains_of_phantoms` stay in the view.
+            keep_islands: keep the `artefact_islands`, which are removed otherwise.
         """
         shape = view.mask.shape
         rgb = scatter_to_image(self.rgb, self.pixels, shape)
@@ -135,13 +135,13 @@ class ViewPrediction(NamedTuple):
         confidence = scatter_to_image(self.confidence[:, None], self.pixels, shape)[0]
         depth = scatter_to_image(self.depth[:, None], self.pixels, shape)[0]
         if fill is not None:
-            mixed = HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb
+            mixed = RAY_FILL_SHARE * fill + (1 - RAY_FILL_SHARE) * rgb
             under_alpha = torch.minimum(mixed, alpha)  # the fill has no alpha of its own
             rgb = torch.where(predicted & view.holes, under_alpha, rgb)
-        if not keep_remains:
+        if not keep_islands:
             colour = torch.where(predicted, rgb.amax(0), view.rgb.amax(0))
             opacity = torch.where(predicted, alpha, view.mask)
-            keep = ~remains_of_phantoms(colour, opacity, predicted)
+            keep = ~artefact_islands(colour, opacity, predicted)
             rgb = rgb * keep
             alpha = alpha * keep
             confidence = confidence * keep
@@ -173,18 +173,21 @@ def surface_points(
     weight = shares.gather(1, around) + 1e-6
     offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
 
-    # The proxy's depth from which this offset counts
+    # The depth that the offset is added to: the pixel's own, or that of a nearer surface in its cell
     cell_row, cell_column = (pixels // CELL_PX).unbind(1)
     cell = distribution.cell_index[cell_row, cell_column]
     own_depth = proxy_depth[tuple(pixels.T)]
     cell_depth = distribution.depth[tuple(distribution.cells.T)][cell]
-    same = (own_depth - cell_depth).abs() < SAME_SURFACE * scale.size_m
-    depth = torch.where(same, own_depth, cell_depth) + scale.size_m * offset
+    same_surface = (own_depth - cell_depth).abs() < SAME_SURFACE * scale.size_m
+    depth = torch.where(same_surface, own_depth, cell_depth) + scale.size_m * offset
     return SurfacePoints(cell, best, shares.amax(1), offset, depth)
 
 
-def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
-    """Small islands around the subject all of whose pixels are `predicted`; `colour` is their largest channel."""
+def artefact_islands(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
+    """Pixels of islands to remove by `IslandRule`. All pixels of such an island are `predicted`.
+
+    `colour` is the largest channel of each pixel.
+    """
     rule = IslandRule()
     visible = (torch.maximum(colour, alpha) > rule.visible).cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))

@@ -33,10 +33,10 @@ STATISTICS_CHANNELS = (3, 3, 4)
 PATCH = 0.08
 """`RayFill` averages colours over squares of this side, in subject sizes: single pixels agree by chance."""
 MIN_COVERAGE = 0.3
-"""`RayFill` measures the distance behind the proxy where at least this share of a pixel is covered by it."""
+"""`RayFill` measures the distance behind the proxy where the proxy covers at least this share of a pixel."""
 CATMULL_ROM = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
-"""Weights of the four values around a position, in a row for each power of the share of the way from
-the second to the third."""
+"""Cubic interpolation weighs four values by polynomials of s, the share of the way from the second to
+the third. Row n has the coefficients of s^n."""
 BAND = 2048
 """A thread takes about this many samples at a time."""
 
@@ -53,8 +53,8 @@ class Rays:
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""
     cameras: Int[Tensor, "ray view"] | None = None
-    """Indices of the source cameras that are sampled on each ray, or more if there are not enough;
-    None for all."""
+    """Indices of the source cameras that are sampled on each ray; None for all. An index beyond the
+    last camera stands for no camera."""
 
     def split(self, size: int | None) -> "list[Rays]":
         """Chunks of `size` rays; None gives one chunk."""
@@ -74,7 +74,7 @@ class Rays:
 
     @property
     def world_from_pixel(self) -> Float[Tensor, "3 3"]:
-        """R K^-1, from (u, v, 1) to what a pixel's ray gains per metre of z-depth, on the CPU.
+        """R K^-1, which turns (u, v, 1) into the step along a pixel's ray per metre of z-depth; on the CPU.
 
         K^-1 is written out, because ONNX has no inverse.
         """
@@ -92,7 +92,7 @@ class Rays:
 
     @cached_property
     def directions(self) -> Float[Tensor, "ray 3"]:
-        """What each ray gains per metre of z-depth, world coordinates."""
+        """The step along each ray per metre of z-depth, world coordinates."""
         uv = self.uv_px.double()
         return F.pad(uv, (0, 1), value=1.0) @ self.world_from_pixel.T.to(uv.device)
 
@@ -101,17 +101,16 @@ class RaySamples(NamedTuple):
     """Samples on rays."""
 
     features: Float[Tensor, "ray sample view feature"]
-    """`CameraFeatures`, stacked; of `sample_rays` all of `config.FEATURES`."""
+    """`CameraFeatures`, stacked; `sample_rays` appends the rest of `config.FEATURES`."""
     prior: Float[Tensor, "ray sample view"]
-    """Initial weights of the cameras, of `sample_rays` only: high near the viewer, and
-    where the sample is not far behind the proxy. The sum is 1, or 0 where no camera has the
-    sample in view."""
+    """Initial weights of the cameras: high near the viewer, and where the sample is not far behind
+    the proxy. The sum is 1, or 0 where no camera has the sample in view. `sample_fill_rays` sets 0."""
     statistics: Float[Tensor, "ray sample 10"]
     """`RayStatistics`, stacked; `sample_fill_rays` computes only the masks."""
 
 
 class CameraFeatures(NamedTuple):
-    """What each source camera has at ray samples; zeros where the sample is not in view."""
+    """What each source camera shows of ray samples; zeros where the sample is not in view."""
 
     colour: Float[Tensor, "ray sample view 3"]
     """RGB in [0, 1] on black."""
@@ -189,7 +188,7 @@ class _Boxes(NamedTuple):
 
 
 def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
-    """Samples the pyramid levels of the source cameras that match rays which are `step_px` apart.
+    """Samples the source cameras, at the pyramid levels that match rays with a spacing of `step_px`.
 
     With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than
     bilinear ones.
@@ -334,7 +333,7 @@ def _distance_behind(rays: Rays, sources: SourceCameras, at: Projections) -> Flo
 def _closeness(
     cosine: Float[Tensor, "ray sample *view"], depth_difference: Float[Tensor, "ray sample *view"]
 ) -> Float[Tensor, "ray sample *view"]:
-    """Prior weights, not normalised: high for cameras near the viewer that have the sample not far behind the proxy."""
+    """Prior weights, not normalised: high for cameras near the viewer, unless the sample is far behind the proxy."""
     return (4 * cosine).exp() / (1 + (6 * depth_difference).exp())
 
 
@@ -349,7 +348,7 @@ def _of_chosen(
 
 
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
-    """Indices of the `count` source cameras whose prior weights are highest on each ray; None if there are no more.
+    """Indices of the `count` source cameras with the highest prior weights on each ray; None if that is all of them.
 
     The weights are added up over the samples of the rays.
     """
@@ -371,7 +370,7 @@ def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ra
 def project_lines(
     rays: Rays, cameras: Cameras
 ) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
-    """Homogeneous image coordinates of rays in every camera: what they gain per metre of z-depth, and their start."""
+    """Rays in homogeneous image coordinates of every camera: their step per metre of z-depth, and their start."""
     cameras = _on_host(cameras)
     P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
     linear = P[:, :, :3]
@@ -415,8 +414,8 @@ def _project_into_all(rays: Rays, sources: SourceCameras) -> tuple[Projections, 
 def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample view"]:
     """Cosine of the angle at each sample between the viewer and each camera.
 
-    Both look from the sample along b, the ray backwards, and along z b + c, where c is the way from
-    the viewer to the camera. The products b b, b c and c c are the same for all samples of a ray.
+    Seen from the sample, the viewer lies along b (the ray reversed), and the camera along z b + c,
+    where c leads from the viewer to the camera. All samples of a ray share b b, b c and c c.
     """
     back = -rays.directions
     z = rays.z_m.double()[..., None]
@@ -433,7 +432,10 @@ def viewing_cosines(rays: Rays, cameras: Cameras) -> Float[Tensor, "ray sample v
 def sample_level(
     levels: MipLevels, at: Projections, channels: int
 ) -> Float[Tensor, "*level ray sample view channel"]:
-    """The first channels of each camera's image, bilinearly, 255 as 1; meaningless where a sample is not in view."""
+    """The first channels of each camera's image, interpolated bilinearly and divided by 255.
+
+    Meaningless where a sample is not in view.
+    """
     position = at.uv_px * levels.scale[..., None] + 0.5
     first = position.floor()
     share = (position - first).float()
@@ -599,7 +601,7 @@ def _lines(rays: Rays, cameras: Cameras) -> list[tuple]:
 
 
 def _at_levels(pyramids: Sequence[Pyramid], levels: Sequence[Sequence[int]]) -> CameraImages:
-    """Two levels of each pyramid, the wide one twice as `sample_camera` takes three images, and their scales."""
+    """Two levels of each pyramid, and their scales. The wide one is repeated: `sample_camera` takes three images."""
     found = []
     for pyramid, (fine, wide) in zip(pyramids, levels, strict=True):
         images = tuple(pyramid.levels[level].numpy() for level in (fine, wide, wide))

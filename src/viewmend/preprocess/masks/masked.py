@@ -152,9 +152,7 @@ class MaskedCapture(CaptureWrapper):
         mask = _mask_of(frame)
         images = [view_rgb(frame, view) for view in range(len(frame.cameras))]
         settled = settle_masks(mask, images, frame.cameras, self.bounds, self.mask_near)
-        if (
-            self.clean_up == "pixels"
-        ):  # masks were compared pixel by pixel already: only empty ones are left out
+        if self.clean_up == "pixels":  # pixels were compared already, so only empty masks are left out
             empty = [name for name in settled.without if not _own_mask(frame, name).any()]
             settled = Settled(mask, {name: settled.without[name] for name in empty})
         self.notes.add(frame.time, settled)
