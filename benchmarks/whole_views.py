@@ -41,7 +41,7 @@ from viewmend.scenes.held_out import LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
-from viewmend.training.views import CORRECT
+from viewmend.training.views import CORRECT_DIFFERENCE
 from viewmend.types import CompletedView
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.weight_files import MissingWeightsError
@@ -180,7 +180,7 @@ def calibration_error(rgb: Tensor, completed: CompletedView, truth: TrueView) ->
         return None
     confidence, correct = (
         completed.confidence[inside],
-        ((rgb - truth.rgb).abs().amax(0) < CORRECT)[inside].float(),
+        ((rgb - truth.rgb).abs().amax(0) < CORRECT_DIFFERENCE)[inside].float(),
     )
     part = (10 * confidence).long().clamp(0, 9)
     gap = torch.zeros(10).index_add_(0, part, confidence - correct)

@@ -67,8 +67,8 @@ class StreamConfig:
     render: RenderConfig = field(default_factory=RenderConfig)
     """How views are rendered, and which of their pixels are inpainted."""
     predict_mask: bool | None = None
-    """Whether M_t is predicted in views where it is not known: the alpha of the error model. None: for
-    inpainters that need it, in streams with an error model."""
+    """Whether M_t is predicted where it is not known, as the alpha of the error model. None: if the
+    inpainter needs it, and there is an error model."""
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 2000.0
@@ -169,7 +169,7 @@ class Stream:
         """Whether a warning has said that the memory does not hold the window."""
 
     def _find_mask_model(self) -> Inpainter | None:
-        """The model whose alpha is M_t where that is not known; None where M_t is not predicted."""
+        """The model that predicts M_t where it is not known; None if M_t is not predicted."""
         wanted = self.config.predict_mask
         if wanted is None:
             wanted = self.inpainter.needs_mask and self.error_model is not None
@@ -246,7 +246,7 @@ class Stream:
         masks = all_masks(images, carving)
         proxy = fuse_geometry(hull, masks, self._depth_model, self.config.render, self.config.fusion)
         fusion_ms = ms_since(start, images.rgb.device)
-        # What was encoded behind the hull does not belong to the new proxy.
+        # Encodings are dropped, because they depend on the hull's depth.
         return CachedFrame(images, to_mmap(proxy), hull.geometry_ms + fusion_ms)
 
     def adopt(self, cached: CachedFrame) -> CachedFrame:
@@ -505,7 +505,8 @@ class Stream:
         stop_if_cancelled()
         masked, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
         stop_if_cancelled()
-        if target is not None and self.inpainter.crop_margin_px(quality) is None:
+        needs_whole_view = self.inpainter.crop_margin_px(quality) is None
+        if target is not None and needs_whole_view:
             masked = crop.uncropped(masked, target)
             crop = Crop.all_of(target)
 

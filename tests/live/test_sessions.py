@@ -282,7 +282,7 @@ def test_a_still_view_may_have_more_pixels_than_the_budget_counts():
     desk.look(id=2, width=800, height=400)
     assert desk.size(desk.due()) == moving, "the first answer is as fast as a moving one"
     assert desk.size(desk.due(STILL_S)) == desk.size(desk.due(FULL_S)) == (800, 400)
-    assert desk.session._enlarged(desk.session.requested.look) == 4, "sides four times as long"
+    assert desk.session._enlargement(desk.session.requested.look) == 4, "sides four times as long"
     desk.look(id=3, moving=True, width=800, height=400)
     assert desk.size(desk.due())[0] == 4 * moving[0], "a large moving view was requested on purpose"
 

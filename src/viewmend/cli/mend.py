@@ -66,10 +66,10 @@ class Options:
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] | None = None
-    """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and
-    composites the view ('target-mask', as in the paper); its mask, which only carves the hull
-    ('hull-with-target-mask'); or nothing, but the alpha that 'views' predicts stands for its mask
-    ('predicted-mask', the default of the paper's model; that of other models is 'strict')."""
+    """What is known of the mask of the --leave-out camera. 'strict': nothing. 'predicted-mask': nothing, but
+    the alpha that 'views' predicts takes its place. 'target-mask': the mask cuts and composites the
+    view, as in the paper. 'hull-with-target-mask': the mask only carves the hull. By default
+    'predicted-mask' for the paper's model, 'strict' for others."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea',
@@ -125,16 +125,18 @@ def run(options: Options) -> int:
 
     # Render and complete the views
     mender = _make_mender(options, inpainter, capture.bounds, held, protocol)
-    mender.background = (turntable and turntable.background) or mender.background
+    if turntable is not None and turntable.background:
+        mender.background = turntable.background
     summary = MendSummary(protocol)
-    plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
-    frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])
+    plan = _plan(options, capture, times, usable, turntable)
+    plan = [(time, target) for time, target in plan if time in usable]
+    frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])  # no repeated reads
     frame = None
-    fps = (turntable and turntable.fps) or capture.fps or STATIC_FPS
+    fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
             say(f"{options.out}: the results of an earlier run will be replaced")
-        views = announce_duration(plan, "views", _faster(options, capture.cameras))
+        views = announce_duration(plan, "views", _speed_advice(options, capture.cameras))
         for time, target in track(views, "inpainting", total=len(plan)):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
@@ -175,7 +177,7 @@ def _check(options: Options) -> None:
         raise ValueError(f"expected --scale above 0 and up to 1, got {options.scale}; for example 0.5")
 
 
-def _faster(options: Options, cameras: "Cameras") -> str:
+def _speed_advice(options: Options, cameras: "Cameras") -> str:
     """Advice that makes a long run shorter; "" for images that are small already."""
     size_px = max(cameras.max_size_px)
     if options.scale < 1 or size_px <= LARGE_PX:

@@ -20,12 +20,24 @@ from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.output_folder import OutputFolder
 
 SHEET_ROWS = 4
+"""The contact sheet has at most this many rows."""
 RESULTS = (
-    *("completed", "holes", "rendered", "true", "cutout", "depth"),
-    *("completed.mp4", "compared.mp4", "cutout.webm", "contact_sheet.png"),
+    "completed",
+    "holes",
+    "rendered",
+    "true",
+    "cutout",
+    "depth",
+    "completed.mp4",
+    "compared.mp4",
+    "cutout.webm",
+    "contact_sheet.png",
 )
+"""A run writes these folders and files."""
 HOLE_COLOUR = (1.0, 0.0, 1.0)
+"""The contact sheet shows holes in this colour, RGB in [0, 1]."""
 DIFFERENCE_GAIN = 3.0
+"""The contact sheet shows differences multiplied by this factor."""
 
 
 class MendOutput:
@@ -40,6 +52,7 @@ class MendOutput:
         self._count = 0
         self._rows: list[list[Tile]] = []
         self._stride = 1
+        """Every view of this stride is a row of the contact sheet; it doubles when the sheet is full."""
 
     def __enter__(self) -> "MendOutput":
         """Lock the folder.
@@ -152,9 +165,8 @@ def sheet_row(step: MendStep) -> list[Tile]:
     if truth is not None:
         images["true"] = truth
         for name, rgb in {"rendered": step.rendered, "completed": step.completed_rgb}.items():
-            images[f"{name} - true, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(
-                0, 1
-            )
+            difference = DIFFERENCE_GAIN * (rgb - truth).abs()
+            images[f"{name} - true, x{DIFFERENCE_GAIN:.0f}"] = difference.clamp(0, 1)
     return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 

@@ -24,7 +24,7 @@ STILL_S = 0.25
 FULL_S = 0.8
 """A view that has been still for this many seconds is rendered again at full quality."""
 MAX_AWAITED_S = 10.0
-"""Playback waits this many seconds for a frame that its clock has passed."""
+"""Playback waits at most this many seconds for a frame that its clock has passed."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class ViewerSession:
         self._wait_ms = 0.0
         """How long the requested look has waited."""
         self._moving_px = 0.0
-        """Pixels of the last look that moved or played. The budget counts in these: a view at rest
-        may have more."""
+        """Pixels of the last look that moved or played. The budget's scales are relative to these: a
+        view at rest may have more."""
         self._encoders = Encoders()
 
     def look(self, look: Look) -> None:
@@ -162,12 +162,12 @@ class ViewerSession:
         self.is_cancelled = True
 
     def _cancel_final_view(self) -> None:
-        """Give up the view that is being rendered if only a resting viewer has use for it; others show a movement."""
+        """Cancel the view that is being rendered if only a viewer at rest needs it. Views of a movement are finished."""
         look = self.requested.look
         self.is_cancelled |= look is not None and (look.full or self._is_refined)
 
     def give_up(self) -> None:
-        """Render the view again if it is asked for again."""
+        """Forget a request that was cancelled, so that its view is rendered if it is still wanted."""
         self.requested = RequestedView()
 
     @property
@@ -176,7 +176,7 @@ class ViewerSession:
         return self.newest_look is not None
 
     def is_content(self, span: Span, edge: float) -> bool:
-        """Whether no view has to be rendered: the view at rest is shown at full quality, or the page draws."""
+        """Whether no view has to be rendered: the newest look is shown at full quality, or the page draws itself."""
         look = self.newest_look
         if look is None:
             return True
@@ -223,7 +223,7 @@ class ViewerSession:
             self.in_flight = None
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
-        """The newest look at the clock's frame, or the same view again at a better level."""
+        """The newest look at the clock's frame, or the same view again at a better level; None for no view."""
         self.buffering = False
         look = self.newest_look
         if look is None or self.in_flight is not None:
@@ -300,11 +300,10 @@ class ViewerSession:
             return level if look.adaptive else replace(level, scale=1.0)
         self.budget.target_ms = self.budget.budget_ms / active_viewers
         level = self.budget.level
-        return replace(
-            level, scale=level.scale * min(1.0, 1 / self._enlarged(look)) if look.adaptive else 1.0
-        )
+        scale = level.scale * min(1.0, 1 / self._enlargement(look)) if look.adaptive else 1.0
+        return replace(level, scale=scale)
 
-    def _enlarged(self, look: Look) -> float:
+    def _enlargement(self, look: Look) -> float:
         """Ratio of the side lengths of this look's image to those of a moving one."""
         return math.sqrt(look.pixels / self._moving_px)
 
@@ -351,7 +350,7 @@ class ViewerSession:
         self.recent.append(SentFrame(self._now(), times, size_bytes))
         if self.budget is not None:
             level = self.rendered_level
-            self.budget.record(replace(level, scale=level.scale * self._enlarged(look)), times)
+            self.budget.record(replace(level, scale=level.scale * self._enlargement(look)), times)
 
     def fail(self, message: str) -> None:
         """Report an error once; the same view is not tried again."""

@@ -14,14 +14,14 @@ from viewmend.types import CompletedView, IncompleteView
 BORDER_PX = 2
 """A rendered crop extends this many pixels beyond the subject's vertices."""
 PATCH_STEP_PX = 16
-"""The patches of a crop lie as in the whole view if it begins at a multiple of this many pixels."""
+"""A crop that begins at a multiple of this many pixels has the same patches as the whole view."""
 NEAR_M = 1e-3
 """A view whose camera has a vertex nearer than this, in metres, or behind it, is not cropped."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """Columns left to right - 1 and rows top to bottom - 1 of a view, pixels."""
+    """A rectangle of a view, pixels; `right` and `bottom` are one past its last column and row."""
 
     left: int
     top: int
@@ -123,9 +123,9 @@ def subject_crop(view: IncompleteView, margin_px: int) -> Crop:
 def grid_px(margin_px: int) -> int:
     """Crops that are inpainted begin and end at multiples of this.
 
-    It is the first power of two, from a patch's step on, that is not less than the margin:
-    smooth fills halve the resolution several times, and so mostly average the same pixels
-    as in the whole view.
+    It is the smallest power of two that is at least the margin and `PATCH_STEP_PX`. Smooth fills
+    halve the resolution several times; on this grid, they mostly average the same pixels as in the
+    whole view.
     """
     return max(PATCH_STEP_PX, 1 << (margin_px - 1).bit_length())
 

@@ -144,9 +144,9 @@ def select_by_gain(
     view: IncompleteView, gain: Float[Tensor, "height width"], fraction: float
 ) -> Float[Tensor, "height width"]:
     """1 on holes and on the pixels of highest gain, up to `fraction` of the proxy's pixels, holes included."""
-    first = (gain + view.holes).flatten()
-    count = min(int(fraction * int((view.mask > 0).sum())), int((first > MIN_GAIN).sum()))
-    chosen = torch.zeros_like(first).index_fill(0, first.topk(count).indices, 1.0).view_as(view.mask)
+    priority = (gain + view.holes).flatten()
+    count = min(int(fraction * int((view.mask > 0).sum())), int((priority > MIN_GAIN).sum()))
+    chosen = torch.zeros_like(priority).index_fill(0, priority.topk(count).indices, 1.0).view_as(view.mask)
     return torch.where(view.holes, 1.0, chosen)
 
 

@@ -66,9 +66,8 @@ def hull_points(
         row = uv[0, :, 1].long().clamp(0, height - 1)
         surface = proxy.depth(camera)[0][row, column]
         visible = in_view(uv, z, camera)[0] & ((surface == 0) | (z[0] <= surface + BEHIND * apart_m))
-        order = torch.where(visible, z[0], 0.0).argsort(descending=True)[
-            : int(visible.sum())
-        ]  # the farthest first
+        farthest_first = torch.where(visible, z[0], 0.0).argsort(descending=True)
+        order = farthest_first[: int(visible.sum())]
         sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(1, MAX_DOT_PX).long()
         rgba = torch.cat([colours, torch.ones_like(colours[:, :1])], 1)[order]
         _draw(

@@ -19,7 +19,7 @@ from viewmend.rendering.error_mask import Evidence, error_rule, holes
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 SELECTIONS = ("angle", "direction")
-"""The rules by which cameras may be closest to a view (`RenderConfig.selection`)."""
+"""The rules that decide which cameras are closest to a view (`RenderConfig.selection`)."""
 SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 """The proxy's depth in the frame's cameras of these names."""
 

@@ -41,7 +41,7 @@ LPIPS_DB = 40.0
 MIN_GAIN_DB = 0.1
 """Better weights have a score that is higher by at least this: smaller gains are chance on a few views."""
 PATIENCE = 6
-"""Validations without a new best score after which a run ends."""
+"""A run ends after this many validations without a new best score."""
 FEW_VALIDATIONS = 2
 """A run with fewer validations than this, at the recipe's interval, is too short to judge."""
 PADDING_PX = 8
@@ -55,7 +55,7 @@ class HeldBack:
     camera: str | None
     """None if the rig has fewer than `MIN_CAMERAS`, or is listed in a splits file."""
     first_frame: int
-    """The first frame that training never uses; 1 if the capture has a single frame, which it does use."""
+    """The first frame that training never uses; 1 if the capture has only frame 0, which training uses."""
 
     @classmethod
     def of(cls, capture: CaptureSource, camera: str | None) -> "HeldBack":
@@ -182,18 +182,31 @@ class ViewScore:
 
 def _subject_box(mask: Tensor) -> tuple[slice, slice]:
     """Rows and columns of the subject with a margin, at least as many as LPIPS needs where the image allows it."""
-    box = []
-    for axis, length in enumerate(mask.shape):
-        own = (mask > 127).any(1 - axis).nonzero()[:, 0]
-        first, last = (
-            (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
-        )
-        short = max(0, MIN_PX["alex"] - (last - first))
-        first = first - (short + 1) // 2
-        last = last + (short + 1) // 2
-        first, last = (0, last - first) if first < 0 else (first, last)
-        box.append(slice(max(0, first - (last - length)), length) if last > length else slice(first, last))
-    return box[0], box[1]
+    foreground = mask > 127
+    height, width = mask.shape
+    rows = foreground.any(1).nonzero()[:, 0].tolist()
+    columns = foreground.any(0).nonzero()[:, 0].tolist()
+    return _with_margin(rows, height), _with_margin(columns, width)
+
+
+def _with_margin(occupied: list[int], length: int) -> slice:
+    """The range of the occupied rows or columns of an image, with a margin; all of them if none is occupied."""
+    if not occupied:
+        return slice(0, length)
+    start = occupied[0] - PADDING_PX
+    end = occupied[-1] + 1 + PADDING_PX
+    missing = max(0, MIN_PX["alex"] - (end - start))
+    start -= (missing + 1) // 2
+    end += (missing + 1) // 2
+
+    # Move the range into the image
+    if start < 0:
+        end -= start
+        start = 0
+    if end > length:
+        start = max(0, start - (end - length))
+        end = length
+    return slice(start, end)
 
 
 def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator[HeldBackView]:
@@ -208,37 +221,40 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
         yield from _views_of(opened.source, opened.held_back, table)
 
 
-def _views_of(capture: CaptureFolder, own: HeldBack, table: bool) -> Iterator[HeldBackView]:
+def _views_of(capture: CaptureFolder, held_back: HeldBack, table: bool) -> Iterator[HeldBackView]:
     names = capture.cameras.names
     count = len(capture.frame_ids)
-    late = range(own.first_frame, count) if count > 1 else range(1)
+    late = range(held_back.first_frame, count) if count > 1 else range(1)
+
+    # Cameras and frames to render
     if table:
-        others = [name for name in names if name != own.camera]
-        chosen = [own.camera] if own.camera else []
+        others = [name for name in names if name != held_back.camera]
+        chosen = [held_back.camera] if held_back.camera else []
         shown = min(MAX_TABLE, len(others))
         chosen += [others[len(others) * n // shown] for n in range(shown)]
         time = _time_with_subject(capture, late)
         wanted = [(name, time) for name in dict.fromkeys(chosen)]
-    elif own.camera is None:
+    elif held_back.camera is None:
         wanted = [(names[n % len(names)], late[len(late) * n // MAX_VIEWS]) for n in range(MAX_VIEWS)]
     else:
         times = [count * n // MAX_VIEWS for n in range(1, MAX_VIEWS)] if count > MAX_VIEWS else range(count)
-        wanted = [(own.camera, time) for time in (*times, late[-1])]
-    without: dict[str, PreparedCapture] = {}
+        wanted = [(held_back.camera, time) for time in (*times, late[-1])]
+
+    # Their views from the other cameras; each camera is prepared once
+    prepared_without: dict[str, PreparedCapture] = {}
     for camera, time in dict.fromkeys(wanted):
-        if camera not in without:
-            without[camera] = prepare(capture, tuple(name for name in names if name != camera))
-        prepared = without[camera]
+        if camera not in prepared_without:
+            prepared_without[camera] = prepare(capture, tuple(name for name in names if name != camera))
+        prepared = prepared_without[camera]
         frame = prepared.read(time)
         if camera not in frame.cameras.names or len(frame.cameras) < 3:
             continue
         if not frame.select([camera]).has_subject:  # there is nothing to score
             continue
-        seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
+        scene = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
-        yield HeldBackView(
-            camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth
-        )
+        trained_on = camera != held_back.camera and count == 1
+        yield HeldBackView(camera, trained_on, stream.add_frame(scene.inputs), scene.truth)
 
 
 def _time_with_subject(capture: CaptureFolder, late: range) -> int:
@@ -312,14 +328,17 @@ class KeptWeights:
         scored = [(step, scores, score) for step, scores, score in scored if score is not None]
         if not scored:
             return None
-        kept_step, kept, best = scored[0]
+        kept_step, first, first_score = scored[0]
+        kept = first
+        best = first_score
         for step, scores, score in scored[1:]:
             if is_better(score, best):
                 kept_step = step
                 kept = scores
                 best = score
-        gains = [score - scored[0][2] for _, _, score in scored[1:]]
-        return cls(kept_step, scored[-1][0], scored[0][1], kept, max(gains, default=0.0))
+        last_step, _, _ = scored[-1]
+        gains = [score - first_score for _, _, score in scored[1:]]
+        return cls(kept_step, last_step, first, kept, max(gains, default=0.0))
 
     def describe(self, start: str, validate_every: int) -> list[str]:
         """What was kept, and why, as sentences; `start` names the model that the run started from."""

@@ -117,7 +117,10 @@ def paper_image_loss(
     truth: Sequence[Float[Tensor, "3 _h _w"]],
     counted: Sequence[Float[Tensor, "_h _w"]] | None = None,
 ) -> ImageLoss:
-    """L_in and L_out with channels summed, over all pixels or those `counted`; Ftilde is the view without patches."""
+    """L_in and L_out with channels summed, over all pixels or those `counted`.
+
+    Where no patch was inpainted, the view itself stands for Ftilde.
+    """
     made = [torch.where(p.coverage > 0, p.inpainted, p.composited.detach()) for p in predictions]
     return image_loss(
         made, counted or [torch.ones_like(p.coverage) for p in predictions], error, truth, "sum"

@@ -100,8 +100,8 @@ def paper_small() -> TrainConfig:
     """The paper's model and objective at smaller widths; for two CPU cores.
 
     Most rigs are as large as the paper's; the others have few cameras and give no mask, so that
-    the model does not forget that holes of a fat hull are often background. Each sample is seen
-    once. Nine scenes of ten have no past frames: a whole window takes eight times as long.
+    the model does not forget that holes are often background if the hull is too large. Each sample
+    is seen once. Nine scenes of ten have no past frames: a whole window takes eight times as long.
     """
     sampling = replace(PaperObjectiveConfig().sampling, window_fraction=0.1, min_hole_px=100)
     return TrainConfig(

@@ -68,7 +68,7 @@ class SampleReplay(Generic[Item]):
 
     @property
     def position(self) -> ReplayPosition:
-        """Where the next batch begins."""
+        """The position from which this buffer can be made again."""
         scene, sample, _ = self._buffer[0]
         return ReplayPosition(scene, sample, len(self._buffer))
 

@@ -89,9 +89,8 @@ class HeldOutCamera:
         """The sample at frame `time` with context of `times`, its own first; None if its holes are too small."""
         now = self.frame(time)
         target = self.rig.calibration(self.held, time).select([self.held])
-        known = (
-            None if self.protocol == "strict" else self.rig.truth(self.held, time)
-        )  # rendered only if needed
+        # The truth is rendered only if it is needed
+        known = None if self.protocol == "strict" else self.rig.truth(self.held, time)
         target_mask, _ = reveal(self.protocol, known)
         view = self.stream.with_render_config(render).render(target, time, target_mask=target_mask)
         if float(view.missing.sum()) < min_hole_px:

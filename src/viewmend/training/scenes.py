@@ -83,7 +83,7 @@ def training_people(config: SceneConfig, split: Split) -> SceneConfig:
 def random_studio(
     config: SceneConfig, frames: int, random: Random, split: Split = "training"
 ) -> StudioConfig:
-    """A studio with random people, rig and imperfections, distributed as real studios differ."""
+    """A studio with random people, rig and imperfections, as varied as real studios are."""
     flawed = random.random() < config.imperfect_fraction
     strength = random.random() if flawed else 0.0
     studio = StudioConfig(
@@ -109,11 +109,16 @@ def random_studio(
         ),
     )
     if config.hard_fraction and random.random() < config.hard_fraction:
-        it = studio.imperfections
-        factor = random.uniform(1, HARD_CALIBRATION)
-        it = replace(it, calibration_px=factor * it.calibration_px, calibration_m=factor * it.calibration_m)
-        it = replace(it, mask_edge_px=random.uniform(1, HARD_MASKS) * it.mask_edge_px)
-        studio = replace(studio, imperfections=it)
+        usual = studio.imperfections
+        calibration_factor = random.uniform(1, HARD_CALIBRATION)
+        mask_factor = random.uniform(1, HARD_MASKS)
+        hard = replace(
+            usual,
+            calibration_px=calibration_factor * usual.calibration_px,
+            calibration_m=calibration_factor * usual.calibration_m,
+            mask_edge_px=mask_factor * usual.mask_edge_px,
+        )
+        studio = replace(studio, imperfections=hard)
     if (
         config.performers is not None
         and config.motions is not None
@@ -128,8 +133,8 @@ def random_studio(
 class CaptureRigs:
     """Frames of captures, resized to the config's sizes and aligned.
 
-    A capture is aligned once, on all cameras but the one that is held back or the only truth. An
-    alignment without each camera in turn would take longer than fine-tuning has.
+    A capture is aligned once, without the camera that is held back or is the only truth. To align it
+    without each other camera in turn would take longer than fine-tuning does.
     """
 
     captures: Sequence[tuple[CaptureSource, str | None]]
@@ -146,14 +151,14 @@ class CaptureRigs:
         random = Random(f"{self.seed}/{number}")
         which = random.randrange(len(self.captures))
         capture, held_out = self.captures[which]
-        own = self.held_back[which] if self.held_back else None
-        last = (len(capture.frame_ids) if own is None else own.first_frame) - 1
+        held_back = self.held_back[which] if self.held_back else None
+        last = (len(capture.frame_ids) if held_back is None else held_back.first_frame) - 1
         first = random.randint(0, max(0, last - max(self.frames)))
         size_px = random.choice(self.config.sizes_px)
         times = sorted({min(first + offset, last) for offset in self.frames})
         frames = {time: limit_size(capture.read(time), size_px) for time in times}
-        if own is not None and own.camera is not None:
-            frames = {time: frame.without([own.camera]) for time, frame in frames.items()}
+        if held_back is not None and held_back.camera is not None:
+            frames = {time: frame.without([held_back.camera]) for time, frame in frames.items()}
         # A camera without an image at some of these frames cannot be held out there.
         complete = [
             n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())
@@ -161,7 +166,7 @@ class CaptureRigs:
         frames = {time: frame.select(complete) for time, frame in frames.items()}
 
         if which not in self._prepared:
-            unused = (held_out, None if own is None else own.camera)
+            unused = (held_out, None if held_back is None else held_back.camera)
             inputs = [name for name in capture.cameras.names if name not in unused]
             self._prepared[which] = prepare(capture, inputs, match_colours=False, tighten_masks=False)
         aligned = replace(self._prepared[which], max_image_size=size_px).cameras

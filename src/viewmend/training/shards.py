@@ -116,12 +116,12 @@ def read_shard(path: Path, member: int | None = None) -> list[Any]:
 
 
 class ShardScenes(Generic[Kind]):
-    """Shards as scenes, in another random order each time all have been used."""
+    """Shards as scenes, in a new random order whenever all have been used."""
 
     def __init__(
         self, folder: Path, seed: str, kind: type[Kind], whole: bool = True, clip_length: int = 1
     ) -> None:
-        """Find the shards. A scene is a whole shard, its samples in random order, or unless `whole` a single item.
+        """Find the shards. A scene is a whole shard with its samples in random order, or a single item if not `whole`.
 
         Raises:
             ShardError: there are none, or the first is damaged.
@@ -184,9 +184,8 @@ def _take_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         return {"tensor": name}
     if is_dataclass(value):
         parts = {f.name: _take_apart(getattr(value, f.name), tensors) for f in fields(value)}
-        kinds = (
-            kind.__name__ for kind in type(value).__mro__
-        )  # lazily selected views are stored as plain ones
+        # A subclass, such as that of lazily selected views, is stored as its base class
+        kinds = (kind.__name__ for kind in type(value).__mro__)
         return {
             "kind": next((kind for kind in kinds if kind in KINDS), type(value).__name__),
             "fields": parts,

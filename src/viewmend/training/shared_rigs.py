@@ -22,11 +22,9 @@ from viewmend.training.scenes import random_studio, training_people
 from viewmend.types import IncompleteView, MultiViewFrame
 
 HELD_FRACTION = 1 / 4
-"""Fraction of a rig's cameras that are held out together; the others carve the hull of all of them."""
-
-
+"""Fraction of a rig's cameras that are held out together; the hull is computed from the others."""
 FEW_CAMERAS = (8, 16)
-"""Smallest and largest number of cameras in rigs of few cameras, whose hulls are fat."""
+"""Smallest and largest number of cameras in rigs of few cameras, whose hulls are too large."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,7 @@ class _SharedRig:
         return tuple(name for name in self.others if name in names)
 
     def _frame(self, time: int, coloured: tuple[str, ...]) -> CachedFrame:
-        """A frame with its hull; only `coloured` cameras have images, or with none of these, all are black."""
+        """A frame with its hull. Only `coloured` cameras have images; without any, all images are black."""
         rest = tuple(name for name in self.others if name not in coloured)
         carving = self.studio.silhouettes(time, rest)
         held = self.studio.silhouettes(time, self.held) if self.protocol == "hull-with-target-mask" else None

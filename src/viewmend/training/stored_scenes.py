@@ -24,7 +24,7 @@ from viewmend.rendering.view import RenderConfig, render_depth
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig, SceneConfig, SceneSource
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
-from viewmend.training.samples import HeldOutCamera, Sample, draw_source_views
+from viewmend.training.samples import HeldOutCamera, Sample, black_image, draw_source_views
 from viewmend.training.scenes import RigSource, Scene
 from viewmend.training.shards import storable
 from viewmend.types import MultiViewFrame
@@ -75,7 +75,7 @@ class StoredView:
     """Differences of consecutive vertex indices of the faces, which compress better than the indices."""
     bounds: Bounds
     left_out: tuple[str, ...] = ()
-    """Cameras that were held out together with this one, this one included; none: this one alone."""
+    """All cameras that were held out together, this one included; () if it was held out alone."""
 
 
 @storable
@@ -123,9 +123,8 @@ class StoredScene:
         if depth is not None:
             context = replace(context, frame=replace(context.frame, depth=frame.select(names).depth))
         assert view.truth.mask is not None, "it was checked"
-        alpha = view.truth.mask[0]
-        black = (view.truth.rgb[0] * (alpha / 255)).round().to(torch.uint8)
-        return Sample(rendered, (), context, black, alpha=alpha, depth=true_depth)
+        truth = black_image(view.truth)
+        return Sample(rendered, (), context, truth, alpha=view.truth.mask[0], depth=true_depth)
 
 
 def _check(frame: MultiViewFrame, cameras: Cameras) -> None:

@@ -34,7 +34,15 @@ from viewmend.models.views.ray_fill import RayFill
 from viewmend.rendering.crop import Crop, subject_crop
 from viewmend.rendering.error_mask import attenuate_background
 from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
-from viewmend.training.objective import MIN_SQUARE, ImageLoss, Objective, StepOutput, load_start, write_rows
+from viewmend.training.objective import (
+    MIN_SQUARE,
+    ImageLoss,
+    Objective,
+    StepOutput,
+    load_start,
+    mean_loss,
+    write_rows,
+)
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import rig_source, validation_scenes
 from viewmend.training.shards import storable
@@ -63,16 +71,14 @@ SMOOTH_GUESS = 0.3
 """This fraction of the views has holes that are guessed from their surroundings only."""
 MIN_GAIN = 0.6
 """Smallest factor by which changed colours are darkened."""
-WRONG = 0.08
-"""Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when
-crops are drawn."""
-CORRECT = 0.1
-"""Largest difference of a channel with which a pixel counts as correct for confidence and error
-prediction."""
-RIGHT = 0.05
-"""A rendered pixel is right if no channel, in [0, 1], differs from the truth by more than this."""
-DAMAGED = 0.08
-"""A change to a right pixel is penalised from this difference of a channel on."""
+WRONG_DIFFERENCE = 0.08
+"""Crops are drawn around rendered pixels of which a channel, in [0, 1], is off by more than this."""
+CORRECT_DIFFERENCE = 0.1
+"""The confidence and error predictions count a pixel as correct if no channel is off by more than this."""
+RIGHT_DIFFERENCE = 0.05
+"""The term `damage` counts a rendered pixel as right if no channel is off by more than this."""
+DAMAGE_DIFFERENCE = 0.08
+"""The term `damage` penalises predictions of right pixels of which a channel is off by more than this."""
 VISIBLE = 0.02
 """A camera sees a point if its true depth there differs by less, in subject sizes."""
 GAIN_WEIGHT = 4.0
@@ -92,7 +98,7 @@ class ViewsLossWeights:
     perceptual: float = 0.7
     """Weight of LPIPS (AlexNet) on a crop, which keeps views sharp."""
     damage: Annotated[float, HIDDEN] = 1.0
-    """Weight of errors beyond `DAMAGED` where the rendered colour was right."""
+    """Weight of errors beyond `DAMAGE_DIFFERENCE` where the rendered colour was right."""
     holes: Annotated[float, HIDDEN] = 4.0
     """Additional weight of pixels that no source view colours."""
     log_error: Annotated[float, HIDDEN] = 0.5
@@ -180,12 +186,13 @@ class TrainingView:
     @property
     def wrong(self) -> Mask:
         """Pixels of the proxy and its rim with an erroneous colour."""
-        return ((self.view.rgb - self.truth / 255).abs().amax(0) > WRONG) & (rim_depth(self.view.depth) > 0)
+        is_off = (self.view.rgb - self.truth / 255).abs().amax(0) > WRONG_DIFFERENCE
+        return is_off & (rim_depth(self.view.depth) > 0)
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """The samples of a source as `TrainingView`s, most with changed colours."""
+    """The samples of a source as `TrainingView`s, most of them recoloured."""
 
     scenes: SceneSource[Sample]
     seed: str
@@ -283,38 +290,42 @@ class ViewsObjective(Objective[ViewSynthNet]):
 
     def forward(self, batch: Sequence[TrainingView]) -> StepOutput:
         """The mean terms of the batch."""
-        terms = [self._terms(random_crop(view)) for view in batch]
-        image = ImageLoss(
-            *(torch.stack(values).mean() for values in zip(*(own[1:] for own in terms), strict=True))
-        )
-        return StepOutput(image, torch.stack([own[0] for own in terms]).mean())
+        outputs = [self._loss(random_crop(view)) for view in batch]
+        image = mean_loss([output.image for output in outputs])
+        return StepOutput(image, torch.stack([output.total for output in outputs]).mean())
 
-    def _terms(self, crop: TrainingView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The weighted sum, L1 in the holes, L1 of all pixels, and the logarithmic error."""
+    def _loss(self, crop: TrainingView) -> StepOutput:
+        """The loss of one crop. Its `image.outside` is the L1 of all pixels."""
         made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.guess)
-        at = tuple(made.pixels.T)
+        rows, columns = made.pixels.unbind(1)
         weights = self.weights
         truth = crop.truth / 255
-        alpha = crop.alpha[at] / 255
-        off = made.rgb - truth[:, at[0], at[1]].T
-        hole = crop.view.holes[at].float()
+        off = made.rgb - truth[:, rows, columns].T
+
+        # Colours: L1, logarithmic error, damage to pixels that were right, differences of neighbours
+        hole = crop.view.holes[rows, columns].float()
         weight = 1 + weights.holes * hole
         colour = (weight * off.abs().mean(1)).sum() / weight.sum()
         log_error = (off.square().mean() + MIN_SQUARE).log10()
-        correct = (off.detach().abs().amax(1) < CORRECT).float()
         total = weights.colour * colour + weights.log_error * log_error
-        right = (crop.view.rgb - truth)[:, at[0], at[1]].abs().amax(0) < RIGHT
-        total = total + weights.damage * (right * F.relu(off.abs().amax(1) - DAMAGED)).mean()
+        was_right = (crop.view.rgb - truth)[:, rows, columns].abs().amax(0) < RIGHT_DIFFERENCE
+        total = total + weights.damage * (was_right * F.relu(off.abs().amax(1) - DAMAGE_DIFFERENCE)).mean()
         total = total + weights.gradient * _gradient_loss(made, off, crop.view.mask.shape)
-        total = total + weights.alpha * (
-            (made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha)
-        )
-        total = total + weights.confidence * _cross_entropy(made.confidence, correct)
+
+        # Alpha and confidence
+        alpha = crop.alpha[rows, columns] / 255
+        alpha_l1 = (made.alpha - alpha).abs().mean()
+        total = total + weights.alpha * (alpha_l1 + 0.3 * _cross_entropy(made.alpha, alpha))
+        is_correct = (off.detach().abs().amax(1) < CORRECT_DIFFERENCE).float()
+        total = total + weights.confidence * _cross_entropy(made.confidence, is_correct)
+
+        # Cells, the whole crop, and predicted errors
         total = total + self._cell_terms(crop, made)
         total = total + weights.perceptual * self._perceptual_term(crop, made)
         total = total + weights.errors * self._error_terms(crop, made, off)
+
         inside = (hole * off.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
-        return total, inside, colour.detach(), log_error.detach()
+        return StepOutput(ImageLoss(inside, colour.detach(), log_error.detach()), total)
 
     def _perceptual_term(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
         """LPIPS of the crop with the predicted pixels against the truth, in float32; 0 for crops that are too small."""
@@ -336,9 +347,12 @@ class ViewsObjective(Objective[ViewSynthNet]):
         found = self.model.errors(crop.view, crop.sources, crop.scale)
         rendered = crop.view.rgb[:, *at].T
         predicted = made.rgb.detach()
-        wrong = ((rendered - (predicted - off.detach())).abs().amax(1) > CORRECT).float()
+        truth = predicted - off.detach()
+        wrong = ((rendered - truth).abs().amax(1) > CORRECT_DIFFERENCE).float()
         alpha = found.alpha[at]
-        gain, rest = ((k * rendered - predicted).square().mean(1) for k in (1.0, alpha.detach()[:, None]))
+        faded = alpha.detach()[:, None] * rendered
+        gain = (rendered - predicted).square().mean(1)
+        rest = (faded - predicted).square().mean(1)
         gains = _cross_entropy(found.gain[at], gain) + _cross_entropy(found.rest[at], rest)
         other = _cross_entropy(found.wrong[at], wrong) + _cross_entropy(alpha, made.alpha.detach())
         return other + GAIN_WEIGHT * gains
@@ -358,6 +372,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
         self, crop: TrainingView, made: ViewPrediction, true_depth: Float[Tensor, "height width"]
     ) -> Float[Tensor, ""]:
         """The terms of cells where the true depth is known: the depth itself, and which cameras see the surface."""
+        # The cells' true offsets behind the proxy, where these are in the range of the hypotheses
         distribution = made.distribution
         weights = self.weights
         cells = tuple(distribution.cells.T)
@@ -366,13 +381,19 @@ class ViewsObjective(Objective[ViewSynthNet]):
         offsets = z.new_tensor(OFFSETS)
         offset = (z - distribution.depth[cells]) / crop.scale.size_m
         known = (z > 0) & (alpha > 0.5) & (offset > offsets[0] - VISIBLE) & (offset < offsets[-1] + 0.1)
+
+        # Cross-entropy with the truth, which is shared between the two nearest hypotheses
         upper = torch.searchsorted(offsets, offset.contiguous()).clamp(1, len(OFFSETS) - 1)
-        part = ((offset - offsets[upper - 1]) / (offsets[upper] - offsets[upper - 1])).clamp(0, 1)
-        chance = distribution.logits.log_softmax(1)
-        lower_log, upper_log = (chance.gather(1, index[:, None])[:, 0] for index in (upper - 1, upper))
-        depth = -_masked_mean((1 - part) * lower_log + part * upper_log, known)
+        lower = upper - 1
+        upper_share = ((offset - offsets[lower]) / (offsets[upper] - offsets[lower])).clamp(0, 1)
+        log_probability = distribution.logits.log_softmax(1)
+        lower_log = log_probability.gather(1, lower[:, None])[:, 0]
+        upper_log = log_probability.gather(1, upper[:, None])[:, 0]
+        depth = -_masked_mean((1 - upper_share) * lower_log + upper_share * upper_log, known)
+
+        # The cameras that see the surface should have all the weight
         seen = visible_cameras(crop, made, z)
-        nearest = upper - (part < 0.5).long()
+        nearest = torch.where(upper_share < 0.5, lower, upper)
         if distribution.cameras is not None:
             seen = seen.gather(1, distribution.cameras)
         trust = distribution.samples.trust[torch.arange(len(nearest)), nearest]
