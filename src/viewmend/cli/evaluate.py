@@ -52,10 +52,9 @@ class RunOptions:
     """Input cameras of a capture: all, or a number of evenly spaced ones; several values are
     separated by commas."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the held-out camera: nothing ('strict'); its mask, which cuts and composites
-    the view ('target-mask', as in the paper); its mask, which only carves the hull
-    ('hull-with-target-mask'); or nothing, but the alpha that 'views' predicts stands for its mask
-    ('predicted-mask')."""
+    """What is known of the mask of the held-out camera. 'strict': nothing. 'predicted-mask': nothing, but
+    the alpha that 'views' predicts takes its place. 'target-mask': the mask cuts and composites the
+    view, as in the paper. 'hull-with-target-mask': the mask only carves the hull."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None

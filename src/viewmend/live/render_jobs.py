@@ -174,7 +174,7 @@ class RenderJob(ABC, Generic[Result]):
         return self.done.done()
 
     def give_up(self) -> None:
-        """The job ends without a result."""
+        """Nothing is left to do after a cancellation."""
 
     def finish(self, result: Result) -> None:
         """Set the result, unless the job was cancelled."""

@@ -92,7 +92,8 @@ class RenderService:
                 self._sessions.remove(session)
 
     @property
-    def _is_wanted(self) -> bool:
+    def _has_requests(self) -> bool:
+        """Whether any session wants views."""
         return any(session.wants_views for session in list(self._sessions))
 
     @property
@@ -123,7 +124,13 @@ class RenderService:
             trimmer.trim_if_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
-                    self.lock.wait(TICK_S if self._is_wanted else IDLE_S if self.is_ready else LOADING_S)
+                    self.lock.wait(self._check_interval_s())
+
+    def _check_interval_s(self) -> float:
+        """Seconds until the sessions are checked again, if nothing wakes the thread."""
+        if self._has_requests:
+            return TICK_S
+        return IDLE_S if self.is_ready else LOADING_S
 
     def _prepare(self) -> bool:
         span = self.source.span
@@ -140,7 +147,7 @@ class RenderService:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
         now = self.now()
         span = self.source.span
-        if not self._is_wanted or not self.is_ready or self.renderer.home is None:
+        if not self._has_requests or not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:
             found = self._next_request(now, span, self.renderer.home)

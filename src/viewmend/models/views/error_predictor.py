@@ -124,7 +124,7 @@ class ErrorPredictor(Network):
         cell_px: int,
         layers: nn.Module | None = None,
     ) -> Float[Tensor, "channel rows columns"]:
-        """An image of the statistics of samples in cells of this side, `behind` their nearest depth."""
+        """An image of cells with the statistics of samples at distances `behind` the nearest depth of each cell."""
         cells = torch.nonzero(near > 0)
         z = near[tuple(cells.T)][:, None] + scale.size_m * near.new_tensor(behind)
         rays = Rays(view, scale, cell_px * (cells.flip(1).double() + 0.5), z)

@@ -46,10 +46,9 @@ class SceneScale:
             median = ordered[((count - 1).clamp_min(0) // 2)]
             size = _size_m((view.mask > 0).sum(), median, view.camera)
             return cls(*(torch.where(count > 0, value, 1.0) for value in (size, median)))
-        median = torch.where(covered, view.depth, torch.nan).nanmedian()
-        area, median = torch.stack(
-            [(view.mask > 0).sum().double(), median.double()]
-        ).cpu()  # one wait for both
+        area_px = (view.mask > 0).sum()
+        median_m = torch.where(covered, view.depth, torch.nan).nanmedian()
+        area, median = torch.stack([area_px.double(), median_m.double()]).cpu()  # one copy from the device
         if bool(median.isnan()):
             return cls(1.0, 1.0)
         return cls(float(_size_m(area.long(), median.float(), view.camera.on_host)), float(median))

@@ -72,7 +72,7 @@ class RayInputs(NamedTuple):
     window: Window
     """The view around each pixel: RGB, M, E, and RGB of the smooth fill."""
     neighbourhoods: Float[Tensor, "neighbourhood 12 11 11"]
-    """Means over cells of both sizes in `CELLS` around each different cell: `CELL_CHANNELS` each."""
+    """Means over the cells around each cell with a missing pixel: `CELL_CHANNELS` for each size in `CELLS`."""
     neighbourhood_index: Int[Tensor, "pixel"]
     """Index of each pixel's neighbourhood; pixels of one cell share it."""
 
