@@ -23,7 +23,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.fusion import FusionConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.geometry.threads import heavy_operations, light_operations
+from viewmend.geometry.threads import all_threads, one_thread
 from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State, check_exclude
 from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
@@ -374,7 +374,7 @@ class Stream:
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         part = crop.of_view(view)
         context = self.context_provider(exclude=exclude)
-        with heavy_operations():
+        with all_threads():
             completed, _ = model.step_on(self.config.background, part, context, model.initial_state())
         found = crop.uncropped(replace(part, target_mask=completed.opacity.clamp(0, 1)), view.camera)
         assert found.target_mask is not None, "it was just given"
@@ -387,7 +387,7 @@ class Stream:
         viewer = self.viewer() if viewer is None else viewer
         return inpainter.advance_state(to_background(background, view), viewer)
 
-    @light_operations()
+    @one_thread()
     def view(
         self,
         target: Cameras,
@@ -514,7 +514,7 @@ class Stream:
         completed = CompletedView(masked, masked.cut_rgb)
         state = self.viewer() if viewer is None else viewer
         if quality.mend:
-            with heavy_operations():
+            with all_threads():
                 completed, state = self.inpainter.step_on(self.config.background, masked, context, state)
         encoding_ms += context.encoding_ms
         inpainting_ms = ms_since(start, masked.rgb.device) - encoding_ms if quality.mend else 0.0

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from viewmend.geometry.threads import heavy_operations, light_operations, parallel_for
+from viewmend.geometry.threads import all_threads, one_thread, parallel_for
 
 
 @pytest.fixture
@@ -80,14 +80,14 @@ def workers(count: int) -> int:
     return len(seen)
 
 
-def test_light_operations_stay_on_one_thread_and_heavy_ones_do_not(three_threads):
+def test_operations_stay_on_one_thread_except_in_all_threads(three_threads):
     assert torch.get_num_threads() == 3
-    with light_operations():
+    with one_thread():
         assert torch.get_num_threads() == 1
         assert workers(3) == 3, "our own loops are shared as ever"
-        with heavy_operations():
+        with all_threads():
             assert torch.get_num_threads() == 3
-            with light_operations():
+            with one_thread():
                 assert torch.get_num_threads() == 1
             assert torch.get_num_threads() == 3
         assert torch.get_num_threads() == 1
@@ -95,7 +95,7 @@ def test_light_operations_stay_on_one_thread_and_heavy_ones_do_not(three_threads
 
 
 def test_threads_are_as_before_after_an_error_and_as_asked_later(three_threads):
-    @light_operations()
+    @one_thread()
     def fails() -> None:
         assert torch.get_num_threads() == 1
         raise ValueError
@@ -104,5 +104,5 @@ def test_threads_are_as_before_after_an_error_and_as_asked_later(three_threads):
         fails()
     assert torch.get_num_threads() == 3
     torch.set_num_threads(2)
-    with light_operations(), heavy_operations():
+    with one_thread(), all_threads():
         assert torch.get_num_threads() == 2, "nothing is remembered from before"

@@ -19,7 +19,7 @@ from viewmend.geometry.mesh import vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.sampling import in_view
 from viewmend.geometry.surface import extract_surface
-from viewmend.geometry.threads import light_operations, parallel_for
+from viewmend.geometry.threads import one_thread, parallel_for
 from viewmend.utils.tensors import OnDevice
 
 LEAST_CONFIDENCE = 1e-3
@@ -67,7 +67,7 @@ class DepthViews(OnDevice):
     """How certain the depth is, in [0, 1]."""
 
 
-@light_operations()
+@one_thread()
 def fuse_depth(
     proxy: GeometryProxy,
     mask: UInt8[Tensor, "view height width"],

@@ -21,7 +21,7 @@ from viewmend.geometry.hull_parts import without_floating_parts
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface
-from viewmend.geometry.threads import light_operations
+from viewmend.geometry.threads import one_thread
 from viewmend.utils.tensors import OnDevice
 
 WORTH_RECARVING = 0.85
@@ -55,7 +55,7 @@ class GeometryProxy(OnDevice):
         return rasterize(self.mesh, cameras, cull="back").depth
 
 
-@light_operations()
+@one_thread()
 def reconstruct(
     mask: UInt8[Tensor, "view height width"],
     cameras: Cameras,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras, pixel_centers
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.threads import light_operations, parallel_for
+from viewmend.geometry.threads import one_thread, parallel_for
 
 NEAR_M = 1e-6
 """A surface nearer than this, in metres, is not drawn."""
@@ -32,7 +32,7 @@ class Raster:
     """Index into the mesh's faces (int32), -1 where there is no surface."""
 
 
-@light_operations()
+@one_thread()
 def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front"] = "none") -> Raster:
     """Draw `mesh` into every camera, images of `cameras.max_size_px`; nothing is drawn beyond a view's own size.
 

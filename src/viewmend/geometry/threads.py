@@ -37,19 +37,19 @@ def parallel_for(work: Callable[[int], object], count: int) -> None:
 
 
 @contextmanager
-def light_operations() -> Iterator[None]:
-    """Run torch operations on the calling thread only, except in `heavy_operations`; `parallel_for` is unaffected.
+def one_thread() -> Iterator[None]:
+    """Run torch operations on the calling thread only, except in `all_threads`; `parallel_for` is unaffected.
 
-    Operations on the pixels of one view take less time than waking another thread. Context manager
-    and decorator.
+    Most operations on one view take less time than waking another thread. Context manager and
+    decorator.
     """
     with _torch_threads(1):
         yield
 
 
 @contextmanager
-def heavy_operations() -> Iterator[None]:
-    """Run torch operations on all threads again inside `light_operations`, for convolutions and networks."""
+def all_threads() -> Iterator[None]:
+    """Run torch operations on all threads again, inside `one_thread`: convolutions and networks gain by that."""
     with _torch_threads(_most_threads()):
         yield
 
@@ -68,7 +68,7 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 
 def _most_threads() -> int:
-    """How many threads torch uses outside of `light_operations`."""
+    """How many threads torch uses outside of `one_thread`."""
     return getattr(_torch, "most", None) or torch.get_num_threads()
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from viewmend.geometry.rim import rim_depth
-from viewmend.geometry.threads import light_operations
+from viewmend.geometry.threads import one_thread
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import BLACK, COMPLETED_MODES, EXTRA_MODES, FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
@@ -199,7 +199,7 @@ class Encoders:
         return part | {"bytes": len(data)}, data
 
 
-@light_operations()
+@one_thread()
 def encode_frame(
     look: Look,
     request: RenderRequest,

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from viewmend.geometry.cameras import Cameras, pixel_centers, unproject
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
-from viewmend.geometry.threads import light_operations
+from viewmend.geometry.threads import one_thread
 from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.rendering.error_mask import Evidence, error_rule, holes
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
@@ -60,7 +60,7 @@ class RenderConfig:
             raise ValueError(f"expected a refine_fraction above 0 and up to 1, got {self.refine_fraction}")
 
 
-@light_operations()
+@one_thread()
 def render_view(
     frame: MultiViewFrame,
     proxy: GeometryProxy,

@@ -17,7 +17,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from viewmend.contrib.broadcast.hls import PLAYLIST, HlsSegmenter
-from viewmend.geometry.threads import light_operations
+from viewmend.geometry.threads import one_thread
 from viewmend.live.encoding import Image, draw_mode
 from viewmend.live.extension import Extension
 from viewmend.live.protocol import Camera, FrameTimes, Limits, Look, Message, OnAir, token_query
@@ -100,7 +100,7 @@ class BroadcastSession(ViewerSession):
         assert look is not None, "a view is rendered for a look"
         self.viewer: State | None = result.viewer
         completed, extra = next(result.eyes)
-        with light_operations():
+        with one_thread():
             image = draw_mode(completed, look.modes[0], look.background or result.background, extra)
         with self._lock:
             if self._is_open:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.geometry.threads import heavy_operations, parallel_for
+from viewmend.geometry.threads import all_threads, parallel_for
 from viewmend.models.views.config import COLOUR, CONTRAST, FEATURES, IN_VIEW, MASK, STATISTICS
 from viewmend.models.views.sampler import RaySamples
 
@@ -78,7 +78,7 @@ class SampleAggregator(nn.Module):
         from viewmend.models.views._sampler_numba import aggregate
 
         count, per_ray, views = prior.shape
-        with torch.autocast("cpu", enabled=False), heavy_operations():
+        with torch.autocast("cpu", enabled=False), all_threads():
             hidden = samples.features @ self.camera.weight.T.float()
             shared = self.all_cameras(samples.statistics) + self.camera.bias.float()
             weight = self.trust.weight[0].float()

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.rim import rim_depth
-from viewmend.geometry.threads import heavy_operations, light_operations
+from viewmend.geometry.threads import all_threads, one_thread
 from viewmend.models.base import ContextProvider, DepthMap, ErrorMap, RenderQuality, State
 from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.network import Network
@@ -218,7 +218,7 @@ class ViewSynthNet(Network):
         return view.closest_views(self.config.num_views)
 
     @torch.no_grad()
-    @light_operations()
+    @one_thread()
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """The predicted errors of a rendered view; None without an `ErrorPredictor` or cameras."""
         if self.errors is None:
@@ -229,7 +229,7 @@ class ViewSynthNet(Network):
         return self.errors.predict(view, sources, context.quality)
 
     @torch.no_grad()
-    @light_operations()
+    @one_thread()
     def predict_depth(self, view: IncompleteView, context: ContextProvider) -> DepthMap | None:
         """The depth of the subject on the proxy and its rim, by the first half of the network: no colour is blended."""
         sources = SourceCameras.closest_to(view, context, self.config.num_views)
@@ -257,7 +257,7 @@ class ViewSynthNet(Network):
         return MARGIN_PX
 
     @torch.no_grad()
-    @light_operations()
+    @one_thread()
     def step(
         self, view: IncompleteView, context: ContextProvider, state: State
     ) -> tuple[CompletedView, State]:
@@ -324,7 +324,7 @@ class ViewSynthNet(Network):
             samples = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             stop_if_cancelled()
-            with heavy_operations():
+            with all_threads():
                 features = self.unet.forward_points(
                     inputs, cells, concatenate_channels(cell_channels.to(inputs))
                 )
@@ -406,7 +406,7 @@ class ViewSynthNet(Network):
         features: Float[Tensor, "1 feature rows columns"],
     ) -> Float[Tensor, "pixel output"]:
         """The last convolutions, at these pixels of an image of this shape."""
-        with self.autocast(), heavy_operations():
+        with self.autocast(), all_threads():
             if inputs.device.type == "cpu" and not torch.is_grad_enabled():
                 return run_tiled(self.blending, features, inputs.to(features), pixels, shape).float()
             upsampled = F.interpolate(features, scale_factor=CELL_PX, mode="bilinear", align_corners=False)

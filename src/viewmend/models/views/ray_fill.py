@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.geometry.threads import heavy_operations, light_operations
+from viewmend.geometry.threads import all_threads, one_thread
 from viewmend.models.base import ContextProvider
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import MARGIN_PX, Fill, fill, pull_push
@@ -145,7 +145,7 @@ class RayFill(Network, Fill):
         )
         self.choose = nn.Linear(20 * width, points + 2)
 
-    @light_operations()
+    @one_thread()
     def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Image:
         """The view's image with all of E filled; None for `sources` leaves the smooth fill."""
         guess = fill(view.rgb, view.error > 0, view.mask > 0)
@@ -157,7 +157,7 @@ class RayFill(Network, Fill):
         """The mixed colours."""
         return self(view, SourceCameras.closest_to(view, context, self.config.num_views)).float().clamp(0, 1)
 
-    @heavy_operations()
+    @all_threads()
     def mix(self, inputs: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         features, smallest, window, neighbourhoods, index = inputs
