@@ -105,8 +105,8 @@ def detail_bands(
 ) -> Float[Tensor, "pixel band image 3"]:
     """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
 
-    The squares grow with the magnification. The finest band of a magnified view would otherwise show where
-    neighbouring pixels were sampled in different cameras: as specks.
+    The squares grow with the magnification. Otherwise, the finest band of a magnified view would add specks, where
+    neighbouring pixels were sampled in different cameras.
 
     Args:
         colours: the images' colours at the pixels.

@@ -393,7 +393,7 @@ class ViewSynthNet(Network):
     def _aggregate_pixels(
         self, samples: RaySamples, surface: SurfacePoints, distribution: DepthDistribution
     ) -> AggregatedSamples:
-        """Weighs the cameras at each pixel. The weights that its cell gave them are the initial ones."""
+        """Weighs the cameras at each pixel, starting from the weights that its cell gave them."""
         prior = distribution.samples.trust[surface.cell, surface.hypothesis]
         with self.autocast():
             return self.pixel_aggregator(samples, prior[:, None])
