@@ -65,7 +65,7 @@ class CompletedAhead:
         self._size_bytes = 0
         self._failed: set[FrameKey] = set()
         self._took_s = {"mesh": 0.0, "view": 0.0}
-        """Seconds that the last one of each kind took; at least as long as it took until one was given up."""
+        """Seconds that the last one of each kind took. One that was cancelled can only raise this."""
         self._tried_s = -RETRY_S
         """When something of a playing frame was last begun."""
         self.changes = 0

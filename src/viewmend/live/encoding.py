@@ -53,10 +53,10 @@ def draw_mode(
         return image
     if mode == "depth":
         opacity = (completed.view.cut_depth > 0).float()
+    elif mode in COMPLETED_MODES:
+        opacity = completed.opacity
     else:
-        opacity = (
-            completed.opacity if mode in COMPLETED_MODES else completed.view.mask if own is None else own[3]
-        )
+        opacity = completed.view.mask if own is None else own[3]
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
     return cv2.add(image, cv2.merge(channels))
@@ -164,11 +164,15 @@ def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth
     near, far = (float(z[surface].min()), float(z[surface].max())) if surface.any() else (1.0, 2.0)
     far = max(far, near * 1.001)
     inverse = 1 / np.where(surface, z, near)
-    q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(
-        np.uint16
-    )
+    steps = 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far))
+    q = np.where(surface, steps, 0).astype(np.uint16)
     deltas = np.diff(q, axis=1, prepend=np.uint16(0))
     return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), stride, near, far)
+
+
+def _depth_stride(longest_px: int) -> int:
+    """Image pixels per depth pixel, for an image whose longer side is this long."""
+    return next((stride for limit_px, stride in DEPTH_STRIDES if longest_px <= limit_px), COARSEST_STRIDE)
 
 
 def unpack_depth(packed: PackedDepth) -> Float[np.ndarray, "height width"]:
@@ -219,13 +223,9 @@ def encode_frame(
             parts.append(part)
             data.append(encoded)
         if look.depth:
-            depth = (
-                surface_depth(completed) if COMPLETED_MODES.issuperset(look.modes) else completed.view.depth
-            )
-            stride = next(
-                (stride for longest, stride in DEPTH_STRIDES if max(depth.shape) <= longest), COARSEST_STRIDE
-            )
-            packed = asdict(pack_depth(depth, stride))
+            only_completed = COMPLETED_MODES.issuperset(look.modes)
+            depth = surface_depth(completed) if only_completed else completed.view.depth
+            packed = asdict(pack_depth(depth, _depth_stride(max(depth.shape))))
             data.append(packed.pop("data"))
             parts.append(
                 {"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed}

@@ -54,7 +54,7 @@ class RenderRequest:
     error_rule: str | None = None
     """None for the renderer's own."""
     extra_modes: frozenset[str] = frozenset()
-    """Images that are not of the renderer's own model, to make as well."""
+    """Additional images, which the renderer's own model does not give."""
     without: tuple[str, ...] = ()
     """Cameras that are not used, neither their images nor their masks."""
     model: str | None = None
@@ -205,6 +205,7 @@ class Renderer:
             ValueError: the frame has no geometry, fewer than two cameras are left, or the true
                 camera is unknown.
         """
+        # The stream, the frame and the viewer's state
         if self._stream is None:
             raise FrameNotReadyError
         without = self.left_out(request.without)
@@ -214,6 +215,8 @@ class Renderer:
         truth = None if request.truth is None else self._true_frame(request.time, request.truth)
         if request.error_rule is not None:
             stream = stream.with_render_config(replace(stream.config.render, error_rule=request.error_rule))
+
+        # The views, and images of the proxy
         asked = request.cameras if truth is None else (truth.cameras,)
         cameras = [camera.to(self._device) for camera in asked]
         views = [self._view(stream, camera, before, request.time, request.quality) for camera in cameras]
@@ -221,6 +224,8 @@ class Renderer:
         extra = tuple(self._render_proxy(cached, camera, request.extra_modes) for camera in cameras)
         times = sum((v.times for v in views), StageTimes(rendering=1000 * (time.perf_counter() - start)))
         completed = [view.completed for view in views]
+
+        # The views by another model
         inpainter = self._inpainter
         scored = completed[0]
         if request.model is not None:
@@ -233,10 +238,13 @@ class Renderer:
             times += StageTimes(inpainting=1000 * (time.perf_counter() - start) - times.rendering)
             inpainter = self._models[request.model]
             scored = others[0]
+
+        # The score and the map of errors
         psnr_db = None
         if truth is not None:
             background = inpainter.background or self._config.background
             psnr_db, extra[0]["error"] = self._score(scored, truth, background)
+
         return RenderResult(
             time=request.time,
             completed=tuple(completed),
@@ -283,7 +291,7 @@ class Renderer:
             raise ValueError("expected a rig, got none yet; see /health")
         cached = None
         if not without or stream is not self._stream:
-            with suppress(ValueError):  # not shown by the server so far: carved without keeping it
+            with suppress(ValueError):  # the stream does not have it: the hull is computed, and not kept
                 cached = stream.cached_frame(frame.time)
         if cached is None:
             cached = cache_frame(frame.without(without).to(self._device), stream.bounds, stream.config.hull)
@@ -325,11 +333,12 @@ class Renderer:
         if key not in self._variants:
             inpainter = self._inpainter
             errors = self._error_model
-            if model is not None:  # by the error rule that it is made for
+            if model is not None:
                 if model not in self._models:
                     self._models[model] = load_inpainter(model, self._device, self._precision)
                 inpainter = self._models[model]
                 errors = errors if errors is not None else self._inpainter
+                # None: the error rule that the model is made for
                 config = replace(config, render=replace(config.render, error_rule=None))
             self._variants[key] = Stream(inpainter, config, self._stream.bounds, errors)
         self._variants.move_to_end(key)
@@ -367,9 +376,8 @@ class Renderer:
         true = camera_image(truth, background)
         seen = composite(background, completed.rgb, completed.opacity)
         errors = (seen - true).abs().amax(0)
-        return psnr(seen, true, truth.mask[0] > FOREGROUND), torch.stack(
-            [*[errors] * 3, torch.ones_like(errors)]
-        )
+        psnr_db = psnr(seen, true, truth.mask[0] > FOREGROUND)
+        return psnr_db, torch.stack([errors, errors, errors, torch.ones_like(errors)])
 
     def _render_proxy(self, cached: CachedFrame, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Images of the proxy; the vertex colours are computed once per frame."""
