@@ -81,9 +81,8 @@ class CachedFrame:
         """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered only once."""
         self._render(names)
         width, height = self.frame.cameras.select(names).max_size_px
-        return torch.stack(
-            [self.depths[name][:height, :width] for name in names]
-        )  # as `frame.select` cuts images
+        # Cut as `frame.select` cuts images
+        return torch.stack([self.depths[name][:height, :width] for name in names])
 
     def _render(self, names: Sequence[str]) -> None:
         """Render the proxy's depth in those of these cameras where it is not known yet."""

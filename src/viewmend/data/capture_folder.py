@@ -18,10 +18,7 @@ from viewmend.data.camera_reader import CameraReader
 from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.images import (
-    read_alpha,
-    uses_alpha,
-)
+from viewmend.data.images import read_alpha, uses_alpha
 from viewmend.data.label_masks import LabelMasks
 from viewmend.data.native_format import (
     CALIBRATION,
@@ -198,9 +195,7 @@ class CaptureFolder:
         frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
         if frame.mask is not None:
             frame = self._with_opaque_masks(frame)
-        if (
-            frame.mask is not None and not frame.has_subject
-        ):  # what remains is noise, as of a compressed video
+        if frame.mask is not None and not frame.has_subject:  # only noise, such as that of a compressed video
             frame = replace(frame, mask=torch.zeros_like(frame.mask))
         return frame
 

@@ -52,9 +52,8 @@ def names_in(folder: Path) -> frozenset[str]:
         with open_container(file) as root:
             group = member(root, folder.relative_to(file).parts)
             members = group if hasattr(group, "keys") else ()
-            return frozenset(
-                name for name in members if isinstance(name, str)
-            )  # h5py returns bytes for invalid UTF-8
+            # h5py returns names of invalid UTF-8 as bytes
+            return frozenset(name for name in members if isinstance(name, str))
     except OSError:
         return frozenset()
 

@@ -168,9 +168,8 @@ def cell_keys(
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
     rules += [value for value in (settings.background, settings.protocol) if value not in ("black", "strict")]
-    rules += [
-        error_rule(settings.stream.render.error_rule or "holes").__module__
-    ]  # has the hash of a user's file
+    # A user's rule has a module whose name contains the hash of its file
+    rules += [error_rule(settings.stream.render.error_rule or "holes").__module__]
     scene_digest = _digest([*rules, *settings.networks])
     of_methods = [settings.precision]
     if settings.top_k is not None:

@@ -29,13 +29,13 @@ PART_BLOCK = 2
 """The blocks by which a hull's parts are labelled have this many voxels along each side; parts less
 than a block apart count as one."""
 ISO = 0.5
-"""A voxel is inside if its occupancy is at least this; the surface is where it is this."""
+"""A voxel is inside if its occupancy is at least this; the surface is where the occupancy equals it."""
 FAINT = 0.1
 """A voxel is surely empty if its occupancy is not above this."""
 NEAR_M = 1e-6
 """A camera does not see what is nearer than this, in metres."""
 SAMPLES = 1 << 24
-"""Cameras are carved together on a device as long as their voxels are no more than this, which
+"""On a device, groups of cameras are carved at once that project at most this many points, which
 bounds the memory."""
 Box = tuple[slice, slice, slice]
 """The first cell along x, y and z, and the one after the last."""
@@ -63,12 +63,10 @@ class HullConfig:
     min_views: int = 2
     """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
-    """Points seen by a smaller share of the cameras count as empty. If fewer cameras than that see
-    the whole subject, because the image border of the others cuts it off, it is enough that as many
-    as these see a point."""
+    """Points seen by a smaller share of the cameras count as empty. If fewer cameras show the subject
+    whole, because image borders cut it off, a point must be seen by as many cameras as these."""
     least_fraction: float = 0.25
-    """Points seen by a smaller share of the cameras count as empty, however many are cut off, if
-    `min_fraction` is not lower."""
+    """Image borders do not lower the required share of the cameras below this."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class Cubes:
         return cls(bounds.on_host.low, side_m, (x, y, z))
 
     def centers(self, device: torch.device) -> Float[Tensor, "cube 3"]:
-        """The cubes' middles on a device, the last axis first."""
+        """The cubes' centres on a device; the index along z changes fastest."""
         axes = [self.low[a] + (torch.arange(self.shape[a]) + 0.5) * self.side_m for a in range(3)]
         on_device = torch.cat(axes).to(device).split(self.shape)
         return torch.stack(torch.meshgrid(*on_device, indexing="ij"), -1).view(-1, 3)
@@ -161,7 +159,7 @@ def visual_hull(
 def occupied_bounds(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> Bounds | None:
-    """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it.
+    """A box inside `bounds` that contains the whole hull; None if the hull is empty.
 
     The box stays on the CPU, where its numbers decide how many voxels there are.
     """
@@ -448,7 +446,8 @@ def occupied_blocks(
     inside = ((first >= 0) & (last < size)).all(-1)
     empty = in_front & inside & (_foreground_tiles(sums, tile, first, last) == 0)
     seen = (z + radius > NEAR_M) & ~(in_front & outside)
-    some = sums[:, -1, -1].any()  # without any foreground, blocks that no image holds whole are empty, too
+    # Without any foreground, blocks that no image shows whole are empty, too
+    some = sums[:, -1, -1].any()
     return (~empty.any(0) & (seen.sum(0) >= needed) & some).view(blocks.shape)
 
 

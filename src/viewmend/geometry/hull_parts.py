@@ -87,8 +87,8 @@ def _unneeded(
 ) -> list[int]:
     """The parts that can go, one after another, while nearly all of every image stays covered.
 
-    What lies next to a covered cell counts as covered: a part that nothing demands has edges where
-    others have theirs, as the same masks have carved both.
+    Cells next to a covered one count as covered, too: the same masks carved an unneeded part and the
+    others, so their edges lie in the same places.
     """
     sizes = np.bincount(part)
     uv, z = project(points, cameras)

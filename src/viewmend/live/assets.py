@@ -177,9 +177,8 @@ class AssetStore:
             if len(self._making) >= MAX_MAKING:
                 raise BusyError("too many frames are being prepared; try again")
             task = self._making[key] = asyncio.create_task(self._prepare(key, version))
-            task.add_done_callback(
-                lambda done: done.cancelled() or done.exception()
-            )  # its waiters may have left
+            # Its exception is retrieved even if no client waits for it any more
+            task.add_done_callback(lambda done: done.cancelled() or done.exception())
         return await asyncio.shield(task)
 
     async def _prepare(self, key: FrameKey, version: str) -> FrameAssets:

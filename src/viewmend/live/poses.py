@@ -69,9 +69,8 @@ def home_view(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     widest = int(gaps.argmax())
     others = gaps.sort().values[:-1]
     if not len(others) or float(gaps[widest]) >= ARC_GAP * float(others[-1]):
-        ahead = (
-            float(after[widest] + gaps[widest] / 2) + 180
-        )  # opposite to the widest gap, relative to camera 0
+        # Opposite to the widest gap, relative to camera 0
+        ahead = float(after[widest] + gaps[widest] / 2) + 180
     else:
         ahead = float(after[after > 1][0]) / 2
     elevation = float(torch.rad2deg(torch.asin((offsets @ up / distance).clamp(-1, 1))).mean())

@@ -230,11 +230,9 @@ def _decode_image(
     expected = f"camera '{name}': expected {kind} of {width} x {height} pixels"
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
+    # The size is checked before the image is decoded
     size_px = size_from_header(data)
-    if size_px is not None and size_px != (
-        width,
-        height,
-    ):  # checked before decoding
+    if size_px is not None and size_px != (width, height):
         raise ProtocolError(f"{expected}, got {size_px[0]} x {size_px[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
     image = decode_image(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -58,9 +58,8 @@ def error_response(status: int, message: str) -> Response:
 
 def asset_response(request: Request, asset: Asset, is_final: bool) -> Response:
     """An asset with its cache headers, or 304 if the client has it; final ones never change under their address."""
-    scope = (
-        "private" if "authorization" in request.headers else "public"
-    )  # the address is enough only with a token
+    # The address alone is not enough if the token is in a header
+    scope = "private" if "authorization" in request.headers else "public"
     cache = f"{scope}, max-age={MAX_AGE_S}, immutable" if is_final else f"{scope}, no-cache"
     headers = {"ETag": asset.etag, "Cache-Control": cache, "X-Content-Type-Options": "nosniff"}
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]

@@ -78,9 +78,8 @@ class Lpips(nn.Module):
             for index, layer in enumerate(self.features):
                 x = layer(x)
                 if index in TAPS[self.backbone]:
-                    unit = (
-                        x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
-                    )  # its gradient is finite at 0, too
+                    # The small number keeps the gradient finite at 0
+                    unit = x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
                     a, b = unit.chunk(2)
                     found.append(torch.einsum("c,nchw->nhw", self.heads[len(found)], (a - b).square()))
             return found

@@ -105,9 +105,8 @@ def _execute(data: bytes) -> Any:
     """The value of a pickle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised for invalid escapes in strings
-        for opcode, argument, _ in pickletools.genops(
-            data
-        ):  # lengths are checked before memory is allocated for them
+        # Lengths are checked before memory is allocated for them
+        for opcode, argument, _ in pickletools.genops(data):
             if "PUT" in opcode.name and (argument or 0) > len(data):
                 raise ValueError(f"the memo {argument}")
         return _Unpickler(io.BytesIO(data), encoding="latin-1").load()

@@ -183,9 +183,8 @@ class OnlineInpainter(Inpainter):
         return replace(state, frames={t: frame for t, frame in state.frames.items() if t < time})
 
     def _windows_with_holes(self, view: IncompleteView, canvas: Canvas) -> list[Window]:
-        if (
-            self.config.framing == "def"
-        ):  # a hole may be too thin for the small canvas, but the view still has it
+        # A hole may be too thin for the small canvas, but the view still has it
+        if self.config.framing == "def":
             return [Window(0, 0)] if bool((view.error > 0).any()) else []
         return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
 

@@ -71,7 +71,6 @@ def _as_array(tensor: Tensor) -> tuple[Any, ...]:
 
 def _unpickle(content: bytes, buffers: Sequence[Any]) -> SharedFrame:
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="The given NumPy array is not writable"
-        )  # they are only read
+        # The arrays are only read
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
         return SharedFrame(*pickle.loads(content, buffers=buffers))

@@ -77,11 +77,10 @@ def _frames_around(
     seen = [at for at, other in enumerate(frames) if other.has_subject]
     wanted = set(frame.cameras.names)
     middle = min(seen or [0], key=lambda at: abs(times[at] - time))
-    while middle < len(frames) - 2 and not wanted <= set(
-        frames[-1].cameras.names
-    ):  # where some cameras have ended
+    # Leave out frames in which some cameras have ended, or have not begun
+    while middle < len(frames) - 2 and not wanted <= set(frames[-1].cameras.names):
         frames.pop()
-    while middle > 1 and not wanted <= set(frames[0].cameras.names):  # or have not begun
+    while middle > 1 and not wanted <= set(frames[0].cameras.names):
         frames.pop(0)
         middle -= 1
     names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]

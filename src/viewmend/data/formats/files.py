@@ -256,9 +256,8 @@ class Footage:
         if calibrated_px and any(
             not 0 <= a - b <= MAX_CROP_PX for a, b in zip(calibrated_px, size, strict=True)
         ):
-            expected = " x ".join(
-                f"{max(-1e9, min(side, 1e9)):g}" for side in calibrated_px
-            )  # huge integers overflow
+            printable = [max(-1e9, min(side, 1e9)) for side in calibrated_px]  # huge integers overflow
+            expected = " x ".join(f"{side:g}" for side in printable)
             got = f"{size[0]} x {size[1]}"
             raise ValueError(
                 f"camera '{name}': expected images of {expected} pixels, got {got}; export that size"

@@ -99,9 +99,8 @@ def collate(
     keys = []
     key_positions = []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
-        uvs = F.pad(
-            centers_px(target.places) / target.view.camera.size_px[0], (0, 1)
-        )  # s = 0 in the novel view
+        # s = 0 in the novel view
+        uvs = F.pad(centers_px(target.places) / target.view.camera.size_px[0], (0, 1))
         valid = torch.ones(len(uvs), dtype=torch.bool, device=uvs.device)
         queries.append(target.tokens[target.incomplete])
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))

@@ -76,9 +76,8 @@ def merge(patches: Patches, places: Places, shape: tuple[int, int, int], step: i
     # Pixels of patches beyond the image go to an extra place: to leave them out would wait for a device.
     flat = torch.where(inside, (places[:, 0, None, None] * height + v) * width + u, pixels).flatten()
 
-    ramp = torch.minimum(
-        offsets + 0.5, size - (offsets + 0.5)
-    )  # falls from a patch's centre to its edges, above 0
+    # Weights fall from a patch's centre to its edges, and are above 0
+    ramp = torch.minimum(offsets + 0.5, size - (offsets + 0.5))
     weights = (ramp[:, None] * ramp / (size / 2) ** 2).to(patches).expand(len(patches), -1, -1)
     weighted = (
         torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1).reshape(-1, channels + 1)

@@ -33,11 +33,8 @@ CHUNK_ENTRIES = 1 << 22
 def rope_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
     """Radians per unit of (u, v, s) for each pair of channels: geometric along its axis, 0 for the other axes."""
     pairs = head_dim // 2
-    per_axis = (
-        3 * pairs // 8,
-        3 * pairs // 8,
-        pairs - 2 * (3 * pairs // 8),
-    )  # three eighths each of u and v, a quarter
+    three_eighths = 3 * pairs // 8
+    per_axis = (three_eighths, three_eighths, pairs - 2 * three_eighths)  # of u, v and s
     octaves = (torch.linspace(0, 1, count, dtype=torch.float64) for count in per_axis)
     return torch.block_diag(*(2 * math.pi / LONGEST * (LONGEST / SHORTEST) ** x for x in octaves)).float()
 
