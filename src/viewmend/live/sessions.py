@@ -162,7 +162,7 @@ class ViewerSession:
         self.is_cancelled = True
 
     def _cancel_final_view(self) -> None:
-        """Cancel the view that is being rendered if only a viewer at rest needs it. Views of a movement are finished."""
+        """Cancel the view being rendered if only a viewer at rest needs it; views of a movement are finished."""
         look = self.requested.look
         self.is_cancelled |= look is not None and (look.full or self._is_refined)
 

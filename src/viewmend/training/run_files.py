@@ -144,7 +144,8 @@ def load_run(
 def _advice(path: Path) -> str:
     if path.name == CHECKPOINT and path.with_name(PREVIOUS_CHECKPOINT).exists():
         return (
-            f"remove the file to start again, or rename {PREVIOUS_CHECKPOINT} to it to resume from the checkpoint before"
+            f"remove the file to start again, or rename {PREVIOUS_CHECKPOINT} to it to resume from the checkpoint "
+            "before"
         )
     return "remove the file to start again"
 
