@@ -94,7 +94,9 @@ def save_run(
 
 def last_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint in a run's folder; None if there is none."""
-    return next((folder / name for name in (CHECKPOINT, PREVIOUS_CHECKPOINT) if (folder / name).exists()), None)
+    return next(
+        (folder / name for name in (CHECKPOINT, PREVIOUS_CHECKPOINT) if (folder / name).exists()), None
+    )
 
 
 def load_run(
