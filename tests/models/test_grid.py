@@ -9,10 +9,10 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project
 from viewmend.models.views.grid import (
-    TILES_AT_ONCE,
     BAND_PX,
     CELL_PX,
     TILE_PX,
+    TILES_AT_ONCE,
     UNet,
     band_sides_px,
     detail_bands,
