@@ -35,8 +35,8 @@ FAINT = 0.1
 NEAR_M = 1e-6
 """A camera does not see what is nearer than this, in metres."""
 SAMPLES = 1 << 24
-"""On a device, groups of cameras are carved at once that project at most this many points, which
-bounds the memory."""
+"""A device carves groups of cameras at once, with at most this many projected points, which bounds
+the memory."""
 Box = tuple[slice, slice, slice]
 """The first cell along x, y and z, and the one after the last."""
 

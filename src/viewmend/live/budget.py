@@ -27,7 +27,7 @@ MEMORY_FRAMES = 5
 HEADROOM = 0.85
 """Fraction of the target that a level may be predicted to take to be chosen."""
 UP_AFTER_FRAMES = 4
-"""At first, the level goes up after this many frames in a row with room for the next one."""
+"""The level first goes up after this many frames in a row with room for the next one."""
 MAX_UP_AFTER_FRAMES = 256
 """Largest number of frames with room that a step up can need."""
 PROBATION_FRAMES = 12

@@ -71,7 +71,7 @@ NUM_GAINS = 3 * len(BAND_PX)
 """A pixel's detail is multiplied by this many gains: three per band, for the blended colours, the
 most trusted camera and the guess."""
 INITIAL_GAIN = 0.3
-"""Before training, the blended colours have this gain in the finest band; all other gains are 0."""
+"""The blended colours have this gain in the finest band before training; all other gains are 0."""
 PIXEL_CHANNELS = 27
 """`pixel_inputs` has this many channels. The last convolutions also get features of the U-Net and
 of the pixel's sample."""
