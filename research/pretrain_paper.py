@@ -63,7 +63,7 @@ class AutoencoderConfig(ObjectiveConfig):
 
     model: Annotated[PaperConfig, HIDDEN] = field(default_factory=paper_small)
     sampling: Annotated[SamplingConfig, HIDDEN] = SAMPLING
-    objective_class = AutoencoderObjective
+    make_objective = AutoencoderObjective
     item = Sample
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[Sample]:

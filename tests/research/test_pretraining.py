@@ -45,7 +45,7 @@ def test_it_trains_encoder_and_decoder_alone(tmp_path):
     train(config, tmp_path / "run")
     torch.manual_seed(config.seed)
     start, trained = (
-        OPTIONS.objective_class(config, OPTIONS, None).model.state_dict(),
+        OPTIONS.make_objective(config, OPTIONS, None).model.state_dict(),
         load_network(tmp_path / "run"),
     )
     changed = {

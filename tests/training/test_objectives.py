@@ -49,7 +49,7 @@ def test_the_recipes_of_the_paper_are_the_papers(name, model):
     last = max(sampling.frames)
     assert set(sampling.frames) == set(window_times(last, paper())) and sampling.min_history == 6
     assert sampling.num_source_views == (3,) and sampling.num_target_frames == 1
-    adversary = objective.objective_class(config, replace(objective, model=paper_small()), None).adversary
+    adversary = objective.make_objective(config, replace(objective, model=paper_small()), None).adversary
     assert adversary is not None and (adversary.loss, adversary.weight) == (GAN, 0.01)
 
 
@@ -138,7 +138,7 @@ def test_all_rays_of_a_view_cost_the_loss_of_its_fill():
     torch.manual_seed(0)
     samples, batches = studio_samples().scene(0), ray_batches(EVERY_PIXEL)
     assert len(samples) == len(batches) > 1
-    objective = RAYS.objective_class(TrainConfig(name="rays", objective=RAYS, **RUN), RAYS, None)
+    objective = RAYS.make_objective(TrainConfig(name="rays", objective=RAYS, **RUN), RAYS, None)
     with torch.no_grad():
         output = objective(batches)
         filled = [objective.model(s.view, SourceCameras.of(s.ray_views, s.view.silhouettes)) for s in samples]
@@ -185,7 +185,7 @@ def test_an_objective_from_outside_uses_the_same_loop(shards, tmp_path):
         sampling: SamplingConfig = SAMPLING
 
         @staticmethod
-        def objective(config, options, start):
+        def make_objective(config, options, start):
             return MeanColour(config, nn.Linear(3, 3, bias=False))
 
         def make_scenes(self, scenes, seed):
@@ -205,7 +205,7 @@ def test_an_objective_from_outside_uses_the_same_loop(shards, tmp_path):
 
 
 def test_outside_the_decoded_patches_the_paper_compares_the_view_itself(tiny):
-    objective = tiny.objective.objective_class(tiny, tiny.objective, None)
+    objective = tiny.objective.make_objective(tiny, tiny.objective, None)
     sample = studio_samples().scene(0)[0]
     truth = [true_image(sample, "white")]
     with torch.no_grad():

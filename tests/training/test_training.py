@@ -36,7 +36,7 @@ def every_two(monkeypatch):
     """Checkpoints are due at every second step."""
     calls = []
     monkeypatch.setattr(RunClock, "checkpoint_due", lambda self: calls.append(0) or len(calls) % 2 == 0)
-    monkeypatch.setattr(RunClock, "saved", lambda self: calls.clear())
+    monkeypatch.setattr(RunClock, "note_checkpoint", lambda self: calls.clear())
 
 
 def test_a_short_run_trains_the_model_and_writes_a_log_and_a_card(tiny, tmp_path):

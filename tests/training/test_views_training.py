@@ -320,7 +320,7 @@ def test_cuda_makes_the_steps_of_both_recipes(tiny_views, capture, tmp_path, pre
 
 def make_objective(options, start=None):
     torch.manual_seed(0)
-    return options.objective_class(TrainConfig(name="views", objective=options, **RUN), options, start)
+    return options.make_objective(TrainConfig(name="views", objective=options, **RUN), options, start)
 
 
 def test_every_parameter_gets_a_gradient(view):

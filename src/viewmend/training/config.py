@@ -112,7 +112,7 @@ class ObjectiveConfig(ABC):
     """
 
     sampling: Annotated[SamplingConfig, HIDDEN]
-    objective_class: ClassVar[Callable[..., Any]]
+    make_objective: ClassVar[Callable[..., Any]]
     """The `Objective` to train; called with a `TrainConfig`, this config, and the model to
     start from or None."""
     item: ClassVar[type]

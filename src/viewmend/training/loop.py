@@ -239,9 +239,9 @@ class Run:
         self.config = config
         self.out = out
         self.processes = processes
-        objective_class = config.objective.objective_class
+        make_objective = config.objective.make_objective
         run_config = _with_precision(config, processes.device)
-        self.objective = objective_class(run_config, config.objective, start).to(processes.device)
+        self.objective = make_objective(run_config, config.objective, start).to(processes.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]

@@ -88,7 +88,7 @@ class PaperObjectiveConfig(ObjectiveConfig):
 
     model: Annotated[PaperConfig, HIDDEN] = field(default_factory=paper_model)
     sampling: Annotated[SamplingConfig, HIDDEN] = SAMPLING
-    objective_class = PaperObjective
+    make_objective = PaperObjective
     item = Sample
     adversarial: float = 0.01
     """Weight lambda_adv of the adversarial loss; 0 trains without a discriminator."""

@@ -119,7 +119,7 @@ class RaysObjectiveConfig(ObjectiveConfig):
     sampling: Annotated[SamplingConfig, HIDDEN] = field(
         default_factory=lambda: SamplingConfig(num_ray_views=8, min_hole_px=15)
     )
-    objective_class = RaysObjective
+    make_objective = RaysObjective
     item = RayBatch
     log_error: float = 2.0
     """Weight of log10 of a view's squared error in the holes; their L1 has weight 1."""

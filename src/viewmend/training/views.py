@@ -418,7 +418,7 @@ class ViewsObjectiveConfig(ObjectiveConfig):
     fused_from: str = "views"
     """Name or folder of the model whose predicted depth is fused, if `fused_fraction` is above 0."""
     loss: ViewsLossWeights = field(default_factory=ViewsLossWeights)
-    objective_class = ViewsObjective
+    make_objective = ViewsObjective
     item = StoredScene
     whole_shards = False
     shard_size = 16

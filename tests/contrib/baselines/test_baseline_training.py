@@ -171,7 +171,7 @@ def test_positional_maps_are_trained_in_parts(network, kind, size, clip_of_two):
 def test_a_network_is_trained_resumed_and_usable_as_a_method(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(RunClock, "checkpoint_due", lambda self: calls.append(0) or len(calls) == 2)
-    monkeypatch.setattr(RunClock, "saved", lambda self: calls.clear())
+    monkeypatch.setattr(RunClock, "note_checkpoint", lambda self: calls.clear())
     clips = studio_samples("tests", clip_length=2)
     list(
         write_shards(

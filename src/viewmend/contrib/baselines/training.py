@@ -215,7 +215,7 @@ class BaselineObjectiveConfig(ObjectiveConfig):
 
     network: Annotated[str, HIDDEN]
     """One of `published.NETWORKS`."""
-    objective_class = BaselineObjective
+    make_objective = BaselineObjective
     item = Sample
     sampling: Annotated[SamplingConfig, HIDDEN] = SAMPLING
     size_px: tuple[int, int] = NATIVE_PX
