@@ -9,9 +9,9 @@ from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ContextProvider, RenderQuality, State
 from viewmend.models.views import model, prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
-from viewmend.models.views.grid import detail_bands, scatter_to_image
+from viewmend.models.views.grid import CELL_PX, detail_bands, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.prediction import artefact_islands
+from viewmend.models.views.prediction import DepthDistribution, artefact_islands
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.rendering.crop import Crop
 from viewmend.stream import Stream
@@ -71,6 +71,44 @@ def test_detail_of_a_magnified_view_follows_the_source_cameras(scene, monkeypatc
     for factor in (1, 3):
         stream.view(stored.resized(factor * width, factor * height))
     assert found == pytest.approx([1, 3], rel=0.15)
+
+
+@torch.no_grad()
+def test_a_magnified_view_has_larger_cells(scene, monkeypatch):
+    stream, _, sources = scene
+    net = stream.inpainter
+    stored = stream.cached_frame().frame.cameras[0]
+    width, height = stored.max_size_px
+    blend, found = net._blend, []
+
+    def record(*arguments):
+        found.append(arguments[-1])
+        return blend(*arguments)
+
+    monkeypatch.setattr(net, "_blend", record)
+    for factor in (1, 2, 4):
+        stream.view(stored.resized(factor * width, factor * height))
+    assert [distribution.cell_px for distribution in found] == [CELL_PX, CELL_PX, 2 * CELL_PX]
+    net(stream.render(stored.resized(4 * width, 4 * height)), sources)
+    assert found[3].cell_px == CELL_PX, "as in training and in exported models"
+    assert len(found[2].cells) < 0.3 * len(found[3].cells)
+
+
+@pytest.mark.parametrize("cell_px", [2, 4])
+def test_values_of_cells_are_interpolated_at_the_centres_of_pixels(cell_px):
+    """A plane over the cells is a plane over the pixels; beyond the outermost centres it is constant."""
+    cells = torch.nonzero(torch.ones(5, 6))
+    values = (3 * cells[:, :1] - 2 * cells[:, 1:]).float()
+    nothing = torch.zeros(0)
+    index = torch.arange(30).view(5, 6)
+    distribution = DepthDistribution(
+        cells, index, nothing, nothing, nothing, None, nothing, cell_px
+    )  # only the cells are used
+    pixels = torch.nonzero(torch.ones(5 * cell_px, 6 * cell_px))
+    at = ((pixels + 0.5) / cell_px - 0.5).clamp(min=0)
+    at = torch.minimum(at, torch.tensor([4.0, 5.0]))
+    expected = 3 * at[:, :1] - 2 * at[:, 1:]
+    torch.testing.assert_close(distribution.interpolate(values, pixels), expected)
 
 
 @torch.no_grad()

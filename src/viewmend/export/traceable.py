@@ -151,7 +151,7 @@ class ViewOutputs(NamedTuple):
 
 
 class ExportedModel(nn.Module):
-    """`ViewSynthNet.step` of one view, without removing `artefact_islands`."""
+    """`ViewSynthNet.step` of one view, without removing `artefact_islands`. Cells have one size in all views."""
 
     def __init__(self, net: ViewSynthNet) -> None:
         super().__init__()

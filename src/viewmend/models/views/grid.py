@@ -27,6 +27,9 @@ BAND_PX = (3, 7)
 shows the subject as large as the source cameras do."""
 MAX_MAGNIFICATION = 8.0
 """The squares grow with a view's magnification up to this factor."""
+LARGE_CELLS_FROM = 3.0
+"""Views of at least this magnification have cells of twice the side. In small ones, the depths of neighbours differ by
+chance, because the source cameras show less than a pixel of theirs, and the view shows this as specks."""
 WIDTH_STEP = 16
 """The U-Net adds this many channels at each coarser scale."""
 

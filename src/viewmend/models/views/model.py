@@ -32,12 +32,14 @@ from viewmend.models.views.error_predictor import ErrorPredictor, fallback_view
 from viewmend.models.views.grid import (
     BAND_PX,
     CELL_PX,
+    LARGE_CELLS_FROM,
     Pixels,
     UNet,
     cell_means,
     concatenate_channels,
     crop_to,
     detail_bands,
+    downsample2x,
     index_image,
     nearest_depth,
     run_tiled,
@@ -185,6 +187,7 @@ class ViewSynthNet(Network):
         scale: SceneScale | None = None,
         where: Mask | None = None,
         guess: Image | None = None,
+        allow_large_cells: bool = False,
     ) -> ViewPrediction:
         """Predicts pixels of a view. `where` selects them; the view's error mask E is ignored.
 
@@ -194,6 +197,8 @@ class ViewSynthNet(Network):
             scale: the scale of the whole view, if `view` is a crop.
             where: pixels outside this mask are not predicted; None predicts the whole proxy and its rim.
             guess: the `coarse_guess` of the whole view, cropped as `view` is; computed if None.
+            allow_large_cells: whether the cells of a magnified view are larger (`LARGE_CELLS_FROM`).
+                Those of training and of exported models are not.
         """
         if guess is None:
             guess = self.coarse_guess(view, sources)
@@ -203,7 +208,12 @@ class ViewSynthNet(Network):
         on_proxy = view.depth > 0
         predicted = on_proxy if where is None else where & on_proxy
         image = ViewImage.of(view, guess, predicted)
-        distribution = self._depth_distribution(view, sources, scale, predicted, image)
+        if allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM:
+            half_view, half_predicted, half_image = halve(view, predicted, image)
+            distribution = self._depth_distribution(half_view, sources, scale, half_predicted, half_image)
+            distribution = distribution._replace(cell_px=2 * CELL_PX)
+        else:
+            distribution = self._depth_distribution(view, sources, scale, predicted, image)
         return self._blend(view, sources, scale, torch.nonzero(predicted), image, distribution)
 
     @torch.no_grad()
@@ -288,7 +298,7 @@ class ViewSynthNet(Network):
         reduced_quality = fraction is not None
         guess = self.coarse_guess(view, sources, quick=reduced_quality)
         ray_fill = None if self.coarse is None or reduced_quality else guess
-        prediction = self(view, sources, where=where, guess=guess)
+        prediction = self(view, sources, where=where, guess=guess, allow_large_cells=True)
         completed = prediction.composite_into(view, where, fades, ray_fill)
         completed, last = steady(completed, where, state)
         return opaque_in_mask(completed), last
@@ -368,7 +378,7 @@ class ViewSynthNet(Network):
         statistics = RayStatistics.unstack(samples.statistics[:, 0])
         inputs = pixel_inputs(colours, mask, statistics, surface, image, pixels)
         inputs = torch.cat([inputs, aggregated.features[:, 0]], 1)
-        out = self._blending_layers(inputs, pixels, view.mask.shape, distribution.features)
+        out = self._blending_layers(inputs, pixels, view.mask.shape, features_at_cells(distribution, view))
         scores, alpha_logit, confidence_logit, gains = out.split(OUTPUT_CHANNELS, 1)
 
         # Blend the colours, then add detail
@@ -414,6 +424,28 @@ class ViewSynthNet(Network):
             out = self.blending(concatenate_channels(near, scatter_to_image(inputs.to(near), pixels, shape)))
         rows, columns = pixels.unbind(1)
         return out[0, :, rows, columns].T.float()
+
+
+def halve(
+    view: IncompleteView, predicted: Mask, image: ViewImage
+) -> tuple[IncompleteView, Bool[Tensor, "rows columns"], ViewImage]:
+    """A view at half its resolution, with its pixels to predict and its inputs: its cells are twice as large."""
+    half_predicted = nearest_depth(view.depth * predicted) > 0
+    guess = downsample2x(replace(view, rgb=image.guess)).rgb
+    half_view = downsample2x(view)
+    return half_view, half_predicted, ViewImage.of(half_view, guess, half_predicted)
+
+
+def features_at_cells(
+    distribution: DepthDistribution, view: IncompleteView
+) -> Float[Tensor, "1 feature rows columns"]:
+    """The U-Net's features in a view's cells of `CELL_PX`, between larger cells bilinearly."""
+    larger = distribution.cell_px // CELL_PX
+    if larger == 1:
+        return distribution.features
+    fine = F.interpolate(distribution.features, scale_factor=larger, mode="bilinear", align_corners=False)
+    rows, columns = (-(-length // CELL_PX) for length in view.mask.shape)
+    return fine[:, :, :rows, :columns]
 
 
 def amplify_detail(

@@ -60,6 +60,8 @@ class DepthDistribution(NamedTuple):
     """Indices of the source cameras that were sampled in each cell; None for all."""
     features: Float[Tensor, "1 feature rows columns"]
     """Output of the U-Net."""
+    cell_px: int = CELL_PX
+    """Side of a cell, pixels of the view: larger in magnified views (`grid.LARGE_CELLS_FROM`)."""
 
     def interpolate(
         self, values: Float[Tensor, "cell channel"], pixels: Pixels
@@ -68,13 +70,15 @@ class DepthDistribution(NamedTuple):
         weighted = F.pad(values, (0, 1), value=1.0)
         padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
 
-        # A pixel's centre is a quarter of a cell off the centre of its own cell, towards the next one.
-        own = pixels // CELL_PX
+        # Shares of a pixel's own cell, and of the cell that is next to the pixel's centre
+        own = pixels // self.cell_px
+        from_center = (pixels % self.cell_px + 0.5) / self.cell_px - 0.5
         last = torch.tensor(self.cell_index.shape, device=own.device) - 1
-        other = torch.minimum((own + 2 * (pixels % CELL_PX) - 1).clamp(min=0), last)
+        other = torch.minimum((own + from_center.sign().long()).clamp(min=0), last)
+        share = from_center.abs().to(padded)
         parts = []
-        for row_share, rows in ((3 / 4, own), (1 / 4, other)):
-            for column_share, columns in ((3 / 4, own), (1 / 4, other)):
+        for row_share, rows in ((1 - share[:, :1], own), (share[:, :1], other)):
+            for column_share, columns in ((1 - share[:, 1:], own), (share[:, 1:], other)):
                 index = self.cell_index[rows[:, 0], columns[:, 1]]
                 parts.append(row_share * column_share * padded[index])
         total = torch.stack(parts).sum(0)
@@ -174,7 +178,7 @@ def surface_points(
     offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
 
     # The depth that the offset is added to: the pixel's own, or that of a nearer surface in its cell
-    cell_row, cell_column = (pixels // CELL_PX).unbind(1)
+    cell_row, cell_column = (pixels // distribution.cell_px).unbind(1)
     cell = distribution.cell_index[cell_row, cell_column]
     own_depth = proxy_depth[tuple(pixels.T)]
     cell_depth = distribution.depth[tuple(distribution.cells.T)][cell]
