@@ -285,8 +285,8 @@ def holes_line(table: Table) -> str:
         )
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
-        f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames have too few hole pixels to be "
-        f"scored there ({table.empty_frames} of them have none).{composition}{advice}"
+        f"{number(of_image, 100, 3)} % of the image{past}. Frames with too few hole pixels to be scored there: "
+        f"{table.thin_frames}; {table.empty_frames} of them have none.{composition}{advice}"
     )
 
 
@@ -349,7 +349,7 @@ def _score_cell(row: Row, column: Column, best: float | None) -> str:
 
 
 def readings_grid(table: Table) -> Grid:
-    """All scores in all readings, and VFID."""
+    """All scores over each region, and VFID."""
     heads = ("method", *(f"{score} {reading}" for score, _, _ in SCORES for reading, _ in READINGS), *VFIDS)
     rows = []
     for row in table.rows:
@@ -359,7 +359,7 @@ def readings_grid(table: Table) -> Grid:
             for _, region in READINGS
         ]
         rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in row.vfid.values())))
-    return _without_empty_columns(Grid(heads, tuple(rows), folded="All scores in all readings"))
+    return _without_empty_columns(Grid(heads, tuple(rows), folded="All scores over each region"))
 
 
 def scenes_grid(report: Report) -> Grid:
