@@ -15,6 +15,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from live.browser.conftest import find_chromium, opened
 from live.browser.stand_in import StandIn
 from live.browser.test_page_keys import is_filled, pairs
+from playwright.sync_api import TimeoutError as PlaywrightTimeout
 from playwright.sync_api import sync_playwright
 
 KEYS = ("n", "b", "x", "r", "f", "g", "t", "h", "l", "Space", ",", ".", "[", "]", "c")
@@ -45,7 +46,7 @@ def main() -> None:
 
 
 def press(browser, mode: int, sequence: list[str]) -> list[tuple[int, str, str]]:
-    """The pairs of a sequence after which a half of the picture stayed empty, with the mode."""
+    """The pairs of a sequence after which a half of the picture stayed empty, or no picture came, with the mode."""
     failed = []
     with StandIn() as server, opened(browser, server) as view:
         view.settle()
@@ -55,7 +56,7 @@ def press(browser, mode: int, sequence: list[str]) -> list[tuple[int, str, str]]
             view.page.keyboard.press(key)
             try:
                 view.until(lambda: is_filled(view), WAIT_S)
-            except AssertionError:
+            except (AssertionError, PlaywrightTimeout):
                 failed.append((mode, before, key))
             before = key
     return failed
