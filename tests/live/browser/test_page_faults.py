@@ -36,6 +36,17 @@ def test_a_lost_connection_comes_back_with_view_and_time(desktop):
     assert cover(desktop) == ""
 
 
+def test_a_page_that_repaints_slowly_gets_no_more_pictures_than_it_takes(browser, server):
+    server.playing = True
+    with opened(browser, server, query="?mode=depth") as view:
+        view.until(lambda: server.viewers and server.viewers[-1].sent > 3)
+        viewer = server.viewers[-1]
+        before = viewer.sent
+        view.page.evaluate("const start = performance.now(); while (performance.now() < start + 3000);")
+        assert viewer.sent <= before + 3, "one that the page had not taken, one that waits, and one on its way"
+        view.until(lambda: viewer.sent > before + 6)
+
+
 def test_who_comes_back_while_a_try_is_due_has_one_connection(desktop):
     look_away = "Object.defineProperty(document, 'hidden', {{value: {}, configurable: true}});"
     look_away += "document.dispatchEvent(new Event('visibilitychange'))"

@@ -56,8 +56,10 @@ export class Connection extends EventTarget {
 
   /** @param {any} news message of the worker */
   #hear(news) {
-    if ("picture" in news) this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
-    else if ("text" in news) this.#receive(JSON.parse(news.text));
+    if ("picture" in news) {
+      this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
+      this.#order({ taken: true });
+    } else if ("text" in news) this.#receive(JSON.parse(news.text));
     else if ("trouble" in news) this.dispatchEvent(new CustomEvent("trouble", { detail: news.trouble }));
     else if ("closed" in news) void this.#ended(news.closed.code, news.closed.reason);
     else {

@@ -6,8 +6,8 @@ import { PictureDecoder } from "./pictures.js";
 import { surfaceOf } from "../draw/surface.js";
 
 /**
- * @typedef {{open: string} | {send: string} | {close: string}} Order what the page wants: a socket to this address in place
- *   of the last, a text to be sent, an end with this reason
+ * @typedef {{open: string} | {send: string} | {close: string} | {taken: true}} Order what the page wants: a socket to this
+ *   address in place of the last, a text to be sent, an end with this reason; or that it has taken a picture
  * @typedef {import("../draw/stage.js").Shown & {bytes: number}} Picture
  * @typedef {{opened: true} | {closed: {code: number, reason: string}} | {text: string} | {picture: Picture} | {trouble: string}} News
  */
@@ -16,6 +16,10 @@ import { surfaceOf } from "../draw/surface.js";
 let socket = null;
 let decoder = new PictureDecoder();
 let queue = Promise.resolve();
+/** Pictures that came and that the page has not taken: a page that repaints slowly must not pile them up. */
+let untaken = 0;
+/** The acknowledgement of the second of them waits until the page has taken the first. @type {(() => void) | null} */
+let heldBack = null;
 
 /** @param {News} news @param {Transferable[]} [transfer] */
 const post = (news, transfer = []) => postMessage(news, /** @type {any} */ (transfer));
@@ -28,6 +32,8 @@ function open(url) {
   socket = own;
   decoder.close();
   decoder = new PictureDecoder();
+  untaken = 0;
+  heldBack = null;
   own.onopen = () => post({ opened: true });
   own.onmessage = ({ data }) => {
     if (socket !== own) return;
@@ -44,7 +50,12 @@ function open(url) {
 /** Images are decoded in parallel and delivered in order. @param {WebSocket} from @param {ArrayBuffer} message */
 function take(from, message) {
   const frame = parseFrame(message);
-  if (from.readyState === WebSocket.OPEN) from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));
+  const acknowledge = () => {
+    if (from.readyState === WebSocket.OPEN) from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));
+  };
+  untaken += 1;
+  if (untaken === 1) acknowledge();
+  else heldBack = acknowledge;
   const decoded = decode(frame);
   decoded.catch(() => {});
   queue = queue
@@ -53,8 +64,17 @@ function take(from, message) {
       post({ picture: { header: frame.header, eyes, bytes: frame.bytes } }, transfer);
     })
     .catch((error) => {
-      if (socket === from) post({ trouble: String(error.message ?? error) });
+      if (socket !== from) return;
+      letGo();
+      post({ trouble: String(error.message ?? error) });
     });
+}
+
+/** The page has taken a picture, or there is none to take: the server may send the next. */
+function letGo() {
+  untaken = Math.max(0, untaken - 1);
+  heldBack?.();
+  heldBack = null;
 }
 
 /** @param {ReturnType<typeof parseFrame>} frame */
@@ -82,5 +102,6 @@ async function decode({ header, parts }) {
 onmessage = ({ data: order }) => {
   if ("open" in order) open(order.open);
   else if ("send" in order) socket?.send(order.send);
+  else if ("taken" in order) letGo();
   else socket?.close(1000, order.close);
 };
