@@ -43,7 +43,9 @@ def test_a_page_that_repaints_slowly_gets_no_more_pictures_than_it_takes(browser
         viewer = server.viewers[-1]
         before = viewer.sent
         view.page.evaluate("const start = performance.now(); while (performance.now() < start + 3000);")
-        assert viewer.sent <= before + 3, "one that the page had not taken, one that waits, and one on its way"
+        assert viewer.sent <= before + 3, (
+            "one that the page had not taken, one that waits, and one on its way"
+        )
         view.until(lambda: viewer.sent > before + 6)
 
 
