@@ -44,6 +44,19 @@ def test_neighbourhoods_equal_the_reference(rng):
     assert torch.equal(again, found) and torch.equal(where, index.repeat(2)), "pixels of one cell share it"
 
 
+def test_exported_neighbourhoods_are_the_same_and_as_few(monkeypatch):
+    incomplete = view(5)
+    incomplete = replace(incomplete, mask=torch.ones_like(incomplete.mask))  # cells of several pixels
+    guess = smooth(incomplete)
+    corners = torch.tensor([[0, 0], [3, incomplete.rgb.shape[2] - 1]])
+    pixels = torch.cat([torch.nonzero(incomplete.error > 0), corners])
+    found, index = multi_scale_context(incomplete, guess, pixels)
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+    exported, exported_index = multi_scale_context(incomplete, guess, pixels)
+    assert torch.allclose(exported[exported_index], found[index], atol=1e-6)
+    assert len(exported) == len(found) < 0.5 * len(pixels)
+
+
 @torch.no_grad()
 def test_known_pixels_stay_and_a_step_blends_the_rest():
     net, incomplete, missing = tiny_rays(), view(5), view(5).error > 0

@@ -261,3 +261,15 @@ def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
     torch.testing.assert_close(own, others, atol=1e-2, rtol=1e-3)
     assert len(chosen.unique(dim=0)) > 3, "they depend on the ray"
     assert choose_cameras(rays, sources, len(sources.cameras)) is None
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_an_export_interpolates_the_same_pixels(dtype, rng, monkeypatch):
+    images = (torch.rand(3, 4, 9, 7, generator=rng) * 255).to(dtype)
+    levels = MipLevels.full(images)
+    uv_px = torch.rand(20, 5, 3, 2, generator=rng).double() * torch.tensor([7.0, 9.0])
+    at = Projections(uv_px, uv_px[..., 0], uv_px[..., 0] >= 0)
+    expected = sample_level(levels, at, 4)
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+    torch.testing.assert_close(sample_level(levels, at, 4), expected, atol=1e-6, rtol=0)
+    assert float(expected.std()) > 0.05

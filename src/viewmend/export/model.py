@@ -75,7 +75,9 @@ def trace(net: ViewSynthNet) -> ExportedProgram:
         dtype = DTYPES[kind.__name__.split("[")[0]]
         shape = [EXAMPLE.get(size) or int(size) for size in kind.dim_str.split()]
         example.append(torch.ones(shape, dtype=dtype))
-    with torch.enable_grad(), _quiet():  # with gradients, layers do not use compiled loops
+    # With symbolic sizes, the cache of traced operations takes longer than what it saves
+    no_cache = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
+    with torch.enable_grad(), no_cache, _quiet():  # with gradients, layers do not use compiled loops
         return torch.export.export(
             ExportedModel(net).eval().requires_grad_(False),
             tuple(example),
@@ -159,10 +161,28 @@ def write_onnx(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -
             opset_version=OPSET,
             external_data=False,
             verbose=False,
+            optimize=False,  # its rewriter compares every node with all others, for minutes
         )
-    assert made is not None
+        assert made is not None
+        _simplify(made)
     made.model.metadata_props.update(notes)
     write_atomically(path, lambda draft: made.save(draft, external_data=False), durable=True)
+
+
+def _simplify(made: "torch.onnx.ONNXProgram") -> None:
+    """Fold constants and merge equal nodes: what pays of the exporter's optimisations, in a second or two."""
+    from onnx_ir.passes import common
+    from onnxscript import optimizer
+
+    optimizer.fold_constants(made.model, onnx_shape_inference=False)
+    passes = (
+        common.RemoveUnusedNodesPass(),
+        common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        common.DeduplicateInitializersPass(),
+        common.CommonSubexpressionEliminationPass(),
+    )
+    for simplify in passes:
+        simplify(made.model)
 
 
 def check_format(format: Format) -> None:

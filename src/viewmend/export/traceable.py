@@ -9,6 +9,7 @@ halves would take the compiler long.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -213,16 +214,22 @@ class PackedSources(SourceCameras):
 
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> tuple[MipLevels, MipLevels]:
         """`SourceCameras.mips`."""
-        images = PackedPyramids.of(self.images.float(), self.cameras.size_px, mask=3)
-        masks = PackedPyramids.of(
-            self.silhouettes.mask[:, None].float(), self.silhouettes.cameras.size_px, mask=0
-        )
+        images, masks = self._packed
         mips = []
         for packed, cameras in ((images, self.cameras), (masks, self.silhouettes.cameras)):
             levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
             mips.append(packed.at(torch.stack(levels)))
         of_images, of_masks = mips
         return of_images, of_masks
+
+    @cached_property
+    def _packed(self) -> "tuple[PackedPyramids, PackedPyramids]":
+        """The pyramids of the source cameras and of the silhouettes, which are traced once for all samples."""
+        masks = self.silhouettes.mask[:, None].float()
+        return (
+            PackedPyramids.of(self.images.float(), self.cameras.size_px, mask=3),
+            PackedPyramids.of(masks, self.silhouettes.cameras.size_px, mask=0),
+        )
 
     def magnification(self, viewer: Cameras, scale: SceneScale) -> Float[Tensor, ""]:
         """`SourceCameras.magnification` as a tensor, on which the sides of the bands of detail depend."""

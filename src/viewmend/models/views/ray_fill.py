@@ -308,16 +308,47 @@ def multi_scale_context(
     subject_px = (view.mask > 0).sum().sqrt().double()
     middle = view.camera.K[0, :2, 2].floor().long().flip(0)
     sides = [box_side_px(size, subject_px) for size in CELLS]
-    cells = torch.cat([(pixels + -middle % side) // side for side in sides], 1)
+    before = [-middle % side for side in sides]
+    cells = _cells_of(pixels, sides, before)
     if torch.compiler.is_exporting():
-        index = torch.arange(pixels.shape[0])
+        firsts, index = _first_pixels(cells, sides, before, view.mask.shape)
+        cells = _cells_of(firsts, sides, before)
     else:
         cells, index = cells.unique(dim=0, return_inverse=True)
 
     # The means of the cells around them
     reach = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device)
     means = []
-    for side, cell in zip(sides, cells.split(2, 1), strict=True):
-        rows, columns = ((cell[:, :, None] + reach) * side - (-middle % side)[:, None]).split(1, 1)
+    for side, offset, cell in zip(sides, before, cells.split(2, 1), strict=True):
+        rows, columns = ((cell[:, :, None] + reach) * side - offset[:, None]).split(1, 1)
         means.append((sums.boxes(rows, columns)[:, 0] / side**2).float().movedim(-1, 1))
     return torch.cat(means, 1), index
+
+
+def _cells_of(
+    pixels: Pixels, sides: Sequence[Int[Tensor, ""]], before: Sequence[Int[Tensor, "2"]]
+) -> Int[Tensor, "pixel 4"]:
+    """Row and column of each pixel's cell of each size. The first cells begin `before` pixels outside the view."""
+    return torch.cat([(pixels + offset) // side for side, offset in zip(sides, before, strict=True)], 1)
+
+
+def _first_pixels(
+    cells: Int[Tensor, "pixel 4"],
+    sides: Sequence[Int[Tensor, ""]],
+    before: Sequence[Int[Tensor, "2"]],
+    shape: torch.Size,
+) -> tuple[Int[Tensor, "neighbourhood 2"], Int[Tensor, "pixel"]]:
+    """The first pixel of each different row of `cells`, and the index of each row among them.
+
+    An exported model has no `unique` over rows. Cells of both sizes overlap in a rectangle, whose first pixel stands
+    for them.
+    """
+    corners = [
+        cell * side - offset for side, offset, cell in zip(sides, before, cells.split(2, 1), strict=True)
+    ]
+    corner = torch.stack(corners).amax(0).clamp_min(0)
+    number = corner[:, 0] * shape[1] + corner[:, 1]
+    present = torch.zeros(shape[0] * shape[1], dtype=torch.long)
+    present = present.index_put((number,), torch.ones_like(number))
+    index = (present.cumsum(0) - 1)[number]
+    return torch.nonzero(present.view(shape)), index
