@@ -263,6 +263,19 @@ def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
     assert choose_cameras(rays, sources, len(sources.cameras)) is None
 
 
+@pytest.mark.parametrize("way", ["kernels", "torch", "export"])
+def test_of_cameras_that_see_a_ray_equally_well_the_first_are_chosen(scene, way, monkeypatch):
+    """Runtimes choose others of equal ones, so the exported model's pixels differed from the model's."""
+    _, view, sources = scene
+    monkeypatch.setattr(SourceCameras, "use_kernels", way == "kernels")
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: way == "export")
+    rays = rays_of(view)
+    in_no_view = replace(rays, z_m=torch.zeros_like(rays.z_m))
+    count = len(sources.cameras) - 1
+    chosen = choose_cameras(in_no_view, sources, count)
+    assert torch.equal(chosen.sort(1).values, torch.arange(count).expand(len(chosen), -1))
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_an_export_interpolates_the_same_pixels(dtype, rng, monkeypatch):
     images = (torch.rand(3, 4, 9, 7, generator=rng) * 255).to(dtype)

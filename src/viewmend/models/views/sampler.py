@@ -37,6 +37,9 @@ MIN_COVERAGE = 0.3
 CATMULL_ROM = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
 """Cubic interpolation weighs four values by polynomials of s, the share of the way from the second to
 the third. Row n has the coefficients of s^n."""
+TIE = 1e-7
+"""The score of each camera is lowered by this much per camera before it, so that of equal ones the first is chosen.
+Every camera that has a sample in view has a score above 1e-5."""
 BAND = 2048
 """A thread takes about this many samples at a time."""
 
@@ -355,14 +358,21 @@ def _look_up(
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
     """Indices of the `count` source cameras with the highest prior weights on each ray; None if that is all of them.
 
-    The weights are added up over the samples of the rays.
+    The weights are added up over the samples of the rays. Of cameras with equal weights, for example of those that
+    have none of these samples in view, the first are chosen: `topk` may take any, and each runtime takes others.
     """
     if torch.compiler.is_exporting():  # of any number of cameras
-        return F.pad(score_cameras_torch(rays, sources), (0, count), value=-1.0).topk(count, 1).indices
+        scores = _without_ties(score_cameras_torch(rays, sources))
+        return F.pad(scores, (0, count), value=-1.0).topk(count, 1).indices
     if len(sources.cameras) <= count:
         return None
     scores = _score_numba(rays, sources) if sources.use_kernels else score_cameras_torch(rays, sources)
-    return scores.topk(count, 1).indices
+    return _without_ties(scores).topk(count, 1).indices
+
+
+def _without_ties(scores: Float[Tensor, "ray camera"]) -> Float[Tensor, "ray camera"]:
+    """The scores, of which equal ones are made to fall from camera to camera."""
+    return scores - TIE * torch.arange(scores.shape[1], device=scores.device)
 
 
 def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
