@@ -265,7 +265,7 @@ def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
 
 @pytest.mark.parametrize("way", ["kernels", "torch", "export"])
 def test_of_cameras_that_see_a_ray_equally_well_the_first_are_chosen(scene, way, monkeypatch):
-    """Runtimes choose others of equal ones, so the exported model's pixels differed from the model's."""
+    """Otherwise each runtime may choose others of equal ones, and sample other cameras than the model."""
     _, view, sources = scene
     monkeypatch.setattr(SourceCameras, "use_kernels", way == "kernels")
     monkeypatch.setattr(torch.compiler, "is_exporting", lambda: way == "export")
