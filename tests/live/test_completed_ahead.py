@@ -9,6 +9,7 @@ import pytest
 import torch
 from live.live_servers import (
     CAMERAS,
+    PIPELINE,
     WAIT_S,
     SmallerFill,
     get,
@@ -18,7 +19,9 @@ from live.live_servers import (
     wait_until,
 )
 from live.test_assets import read_image, read_shape
+from live.test_comparison import Ball
 from reference.ball import BallCapture
+from reference.other_device import other_device
 
 from viewmend.live.assets import Asset, CompletedImage
 from viewmend.live.completed_ahead import RETRY_S, CompletedAhead
@@ -225,6 +228,19 @@ def test_a_page_gets_a_mesh_fused_from_predicted_depth():
 
         assert 0.1 * volume_m3(about, hull) < volume_m3(small, fused) < 0.8 * volume_m3(about, hull)
         assert get(f"{server.url}/assets/1/mesh?v={version}")[0] == 404, "this frame was not shown"
+
+
+def test_a_mesh_is_fused_on_another_device(monkeypatch):
+    def fused(device):
+        renderer = Renderer(Ball(), SmallerFill(), PIPELINE, completed_cameras=2)
+        renderer._device = device
+        assert renderer.prepare(0)
+        _, about, arrays = read_shape(renderer.fuse_mesh(0, ()).content)
+        return volume_m3(about, arrays)
+
+    expected = fused("cpu")
+    with other_device(monkeypatch) as device:
+        assert fused(device) == pytest.approx(expected, rel=0.01)
 
 
 def test_without_a_page_that_draws_nothing_is_completed_ahead():

@@ -312,7 +312,7 @@ class Renderer:
         masks = all_masks(cached.frame)
         render = self._config.render
         proxy = fuse_geometry(cached, masks, self._depth_model, render, self._config.fusion)
-        return make_mesh(cached.frame, proxy.to("cpu"), render)
+        return make_mesh(cached.frame.to("cpu"), proxy.to("cpu"), render)
 
     def complete_virtual_camera(self, index: int, without: tuple[str, ...], number: int) -> CompletedImage:
         """The view of a virtual camera, as a further source image of a frame; errors as `render`."""
