@@ -98,17 +98,23 @@ def test_the_mesh_comes_before_the_views():
     assert mesh is not None and mesh.content == b"mesh" and ahead.mesh((1, ())) is None
 
 
-def test_a_mesh_that_takes_longer_than_a_frame_does_not_keep_views_from_playing_frames(monkeypatch):
+def slow_down(ahead: CompletedAhead, method: str, monkeypatch) -> list[float]:
+    """Let a method of the renderer take half a second of a clock that stands still otherwise; returns the clock."""
     now = [1000.0]
     monkeypatch.setattr("viewmend.live.completed_ahead.time.monotonic", lambda: now[0])
-    ahead = CompletedAhead(FusingRenderer())
-    fuse = ahead._renderer.fuse_mesh
+    make = getattr(ahead._renderer, method)
 
-    def slow(*frame):
+    def slow(*order):
         now[0] += 0.5
-        return fuse(*frame)
+        return make(*order)
 
-    ahead._renderer.fuse_mesh = slow
+    monkeypatch.setattr(ahead._renderer, method, slow)
+    return now
+
+
+def test_a_mesh_that_takes_longer_than_a_frame_does_not_keep_views_from_playing_frames(monkeypatch):
+    ahead = CompletedAhead(FusingRenderer())
+    slow_down(ahead, "fuse_mesh", monkeypatch)
     ahead.note_drawn((0, ()))
     ahead.note_drawn((1, ()))
     ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
@@ -148,15 +154,7 @@ def test_a_failure_ends_the_views_of_its_frame(ahead, caplog):
 
 
 def test_playing_frames_are_completed_only_if_a_view_takes_less_than_a_frame(ahead, monkeypatch):
-    now = [1000.0]
-    monkeypatch.setattr("viewmend.live.completed_ahead.time.monotonic", lambda: now[0])
-    complete = ahead._renderer.complete_virtual_camera
-
-    def slow(*order):
-        now[0] += 0.5
-        return complete(*order)
-
-    ahead._renderer.complete_virtual_camera = slow
+    now = slow_down(ahead, "complete_virtual_camera", monkeypatch)
     ahead.note_drawn((0, ()))
     ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
     assert ahead.choose([shown(0, frame_s=0.1)]) is None, "the last view took half a second"

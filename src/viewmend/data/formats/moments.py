@@ -85,9 +85,13 @@ def _check_moments(patterns: Sequence[tuple[str, tuple[str, ...]]], ids: Sequenc
     counts = [sum(frame in found for _, found in patterns) for frame in ids]
     shared = [count for count in counts if 2 * count > len(patterns)]
     if 2 * len(shared) < len(counts):
-        first, second = (pattern.replace("{frame}", (*found, "")[0]) for pattern, found in patterns[:2])
+        examples = []
+        for pattern, found in patterns[:2]:
+            frame = found[0] if found else ""
+            examples.append(pattern.replace("{frame}", frame))
         expected = "the same number in the names of all cameras' images of one moment"
-        raise ValueError(f"expected {expected}, got others (such as {first} and {second}); rename the images")
+        got = f"others (such as {' and '.join(examples)})"
+        raise ValueError(f"expected {expected}, got {got}; rename the images")
 
 
 def _by_pose(images: Sequence[PosedImage]) -> list[list[int]] | None:
