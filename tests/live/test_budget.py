@@ -204,9 +204,9 @@ def test_single_viewers_and_fast_machines_have_full_resolution():
 
 
 def test_with_idle_viewers_an_image_takes_less_time():
-    limited = limit(3.0).apply(MOVING, LARGEST, 1, has_company=True)
+    limited = limit(3.0).apply(MOVING, LARGEST, 1, has_other_viewers=True)
     assert 3.0 * limited.scale**2 == pytest.approx(IDLE_WAIT_S)
-    assert limit(0.9).apply(MOVING, LARGEST, 1, has_company=True) == MOVING
+    assert limit(0.9).apply(MOVING, LARGEST, 1, has_other_viewers=True) == MOVING
 
 
 def test_the_slowest_of_the_last_large_images_counts():

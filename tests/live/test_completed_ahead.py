@@ -56,14 +56,14 @@ class RingRenderer(Renderer):
 class FusingRenderer(RingRenderer):
     """Makes empty meshes, too."""
 
-    fuses_ahead = True
+    makes_meshes_ahead = True
 
     def fuse_mesh(self, index, without):
         return Asset(b"mesh", "application/octet-stream")
 
 
-def shown(time: int, eye=None, frame_s=math.inf, without=()) -> ShownFrame:
-    return ShownFrame(time, without, eye, frame_s)
+def shown(time: int, eye=None, interval_s=math.inf, without=()) -> ShownFrame:
+    return ShownFrame(time, without, eye, interval_s)
 
 
 @pytest.fixture
@@ -72,11 +72,11 @@ def ahead() -> CompletedAhead:
 
 
 def make_all(ahead: CompletedAhead, *frames: ShownFrame) -> list[int]:
-    """Make everything that is due; the numbers of the virtual cameras in their order."""
+    """Make everything that is due; the numbers of the virtual cameras in this order."""
     numbers = []
-    while order := ahead.choose(frames):
-        ahead.make(order)
-        numbers.append(order.number)
+    while task := ahead.choose(frames):
+        ahead.make(task)
+        numbers.append(task.camera)
     return numbers
 
 
@@ -85,7 +85,7 @@ def test_only_frames_that_a_page_draws_are_completed(ahead):
     ahead.note_drawn((0, ()))
     assert ahead.choose([shown(1)]) is None and ahead.choose([shown(0, without=("c1",))]) is None
     assert make_all(ahead, shown(0)) == list(range(COUNT))
-    assert ahead.counts() == {(0, ()): COUNT} and ahead.changes == COUNT
+    assert ahead.counts() == {(0, ()): COUNT} and ahead.num_made == COUNT
     assert ahead.image((0, ()), 103) is not None and ahead.image((0, ()), 3) is None
 
 
@@ -93,7 +93,7 @@ def test_the_mesh_comes_before_the_views():
     ahead = CompletedAhead(FusingRenderer())
     ahead.note_drawn((0, ()))
     assert make_all(ahead, shown(0)) == [None, *range(COUNT)]
-    assert ahead.counts() == {(0, ()): 1 + COUNT} and ahead.changes == 1 + COUNT
+    assert ahead.counts() == {(0, ()): 1 + COUNT} and ahead.num_made == 1 + COUNT
     mesh = ahead.mesh((0, ()))
     assert mesh is not None and mesh.content == b"mesh" and ahead.mesh((1, ())) is None
 
@@ -104,9 +104,9 @@ def slow_down(ahead: CompletedAhead, method: str, monkeypatch) -> list[float]:
     monkeypatch.setattr("viewmend.live.completed_ahead.time.monotonic", lambda: now[0])
     make = getattr(ahead._renderer, method)
 
-    def slow(*order):
+    def slow(*arguments):
         now[0] += 0.5
-        return make(*order)
+        return make(*arguments)
 
     monkeypatch.setattr(ahead._renderer, method, slow)
     return now
@@ -117,10 +117,10 @@ def test_a_mesh_that_takes_longer_than_a_frame_does_not_keep_views_from_playing_
     slow_down(ahead, "fuse_mesh", monkeypatch)
     ahead.note_drawn((0, ()))
     ahead.note_drawn((1, ()))
-    ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
-    order = ahead.choose([shown(1, frame_s=0.1)])
-    assert order is not None and order.number is not None
-    assert ahead.choose([shown(1, frame_s=0.6)]).number is None
+    ahead.make(ahead.choose([shown(0, interval_s=0.1)]))
+    task = ahead.choose([shown(1, interval_s=0.1)])
+    assert task is not None and task.camera is not None
+    assert ahead.choose([shown(1, interval_s=0.6)]).camera is None
 
 
 def test_views_near_the_viewer_come_first(ahead):
@@ -146,21 +146,21 @@ def test_another_rig_starts_again(ahead):
 
 def test_a_failure_ends_the_views_of_its_frame(ahead, caplog):
     ahead.note_drawn((13, ()))
-    order = ahead.choose([shown(13)])
+    task = ahead.choose([shown(13)])
     with pytest.raises(RuntimeError) as failure:
-        ahead.make(order)
-    ahead.give_up(order, failure.value)
+        ahead.make(task)
+    ahead.note_failure(task, failure.value)
     assert ahead.choose([shown(13)]) is None and "bad luck" in caplog.text
 
 
 def test_playing_frames_are_completed_only_if_a_view_takes_less_than_a_frame(ahead, monkeypatch):
     now = slow_down(ahead, "complete_virtual_camera", monkeypatch)
     ahead.note_drawn((0, ()))
-    ahead.make(ahead.choose([shown(0, frame_s=0.1)]))
-    assert ahead.choose([shown(0, frame_s=0.1)]) is None, "the last view took half a second"
-    assert ahead.choose([shown(0, frame_s=0.6)]) and ahead.choose([shown(0)])
+    ahead.make(ahead.choose([shown(0, interval_s=0.1)]))
+    assert ahead.choose([shown(0, interval_s=0.1)]) is None, "the last view took half a second"
+    assert ahead.choose([shown(0, interval_s=0.6)]) and ahead.choose([shown(0)])
     now[0] += RETRY_S
-    assert ahead.choose([shown(0, frame_s=0.1)]), "tried again"
+    assert ahead.choose([shown(0, interval_s=0.1)]), "tried again"
 
 
 @contextlib.contextmanager
@@ -246,15 +246,15 @@ def test_without_a_page_that_draws_nothing_is_completed_ahead():
         say_hello(viewer)
         viewer.send(json.dumps({"type": "look", "id": 1, "width": 32, "height": 32}))
         wait_until(lambda: server.service.counts["frames"] >= 1)
-        assert not server.service.complete_ahead() and server.service.ahead.changes == 0
+        assert not server.service.make_ahead() and server.service.ahead.num_made == 0
 
 
 @pytest.mark.parametrize("news", [{"type": "look", "id": 2, "full": True}, {"type": "clock", "seek": 1}])
 def test_a_view_that_a_viewer_asks_for_comes_first_and_an_old_frame_is_dropped(news):
     begun = []
 
-    def complete_for_ever(*order):
-        begun.append(order)
+    def complete_for_ever(*arguments):
+        begun.append(arguments)
         while True:
             stop_if_cancelled()
 
@@ -268,4 +268,4 @@ def test_a_view_that_a_viewer_asks_for_comes_first_and_an_old_frame_is_dropped(n
             page.send(json.dumps(news))
             while not isinstance(page.recv(timeout=WAIT_S), bytes):
                 pass
-        assert server.service.ahead.changes == 0
+        assert server.service.ahead.num_made == 0

@@ -48,8 +48,8 @@ def malformed(chance: random.Random):
 
 
 def test_thousands_of_malformed_messages_change_nothing(monkeypatch):
-    monkeypatch.setattr(connection, "FAULTS_PER_S", 1e9)
-    monkeypatch.setattr(connection, "FAULTS_AT_ONCE", 1e9)
+    monkeypatch.setattr(connection, "REJECTED_PER_S", 1e9)
+    monkeypatch.setattr(connection, "REJECTED_AT_ONCE", 1e9)
     chance = random.Random(0)
     with running(limits=Limits(messages_per_s=100_000)) as server:
         with open_websocket(server) as bad:

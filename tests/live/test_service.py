@@ -64,7 +64,7 @@ class Eager(RenderJob):
 
     def deliver(self, request, result):
         self.log.append(self.name)
-        return FrameTimes(**vars(result.times), encode=2.0)
+        return FrameTimes(encode=2.0) + result.times
 
     def give_up(self):
         self.log.append(f"{self.name} gave up")

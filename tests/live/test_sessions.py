@@ -121,6 +121,15 @@ def test_a_cancelled_look_is_neither_rendered_nor_sent(ball_view):
     assert [unpack(message)[0]["look"] for message in desk.sent] == [2]
 
 
+def test_a_look_after_a_cancelled_one_replaces_nothing():
+    desk = Desk(paused=True)
+    desk.look(id=1)
+    assert desk.due() is not None
+    desk.session.cancel()
+    desk.look(id=2)
+    assert desk.session.dropped == 0
+
+
 def test_only_a_final_view_is_cancelled_by_what_replaces_it():
     desk = Desk(budget_ms=50.0, paused=True)
     desk.look(id=1)
@@ -147,9 +156,9 @@ def test_a_still_view_is_refined_in_two_steps():
     assert desk.due(STILL_S / 2) is None
     better = desk.due(STILL_S)
     assert desk.size(better) == (160, 160) and better.quality.context_times == 0
-    assert not desk.session._is_full and desk.due(0.1) is None
+    assert not desk.session._is_final and desk.due(0.1) is None
     best = desk.due(FULL_S)
-    assert best.quality.context_times == FULL.context_times and desk.session._is_full
+    assert best.quality.context_times == FULL.context_times and desk.session._is_final
     assert best.quality.top_k == 100 and desk.due(1.0) is None
 
 

@@ -79,7 +79,7 @@ def test_pages_show_what_the_program_wants():
 
 @in_own_loop
 async def test_what_is_shown_while_the_first_page_opens_reaches_it():
-    """The program sets it on its own thread, perhaps just after the page was informed."""
+    """The program sets it on its own thread, perhaps just after the page was sent what was due."""
     source = Mock(span=Span(), status=SourceStatus())
     service = Mock(
         spec=RenderService,
@@ -87,10 +87,10 @@ async def test_what_is_shown_while_the_first_page_opens_reaches_it():
         renderer=Mock(rig_json=None),
         error=None,
         now=lambda: 0.0,
-        ahead=Mock(changes=0),
+        ahead=Mock(num_made=0),
     )
     registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
-    page.inform.side_effect = lambda shared: shown.append(shared.show) or math.inf
+    page.send_due.side_effect = lambda shared: shown.append(shared.show) or math.inf
     registry.join(page)
     registry.shown = {"type": "show", "time": 1}
     end = time.monotonic() + WAIT_S

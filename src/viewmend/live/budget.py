@@ -167,15 +167,15 @@ class ResolutionLimit:
             self._seconds_per_px.append(seconds / (pixels * _cost_per_px(level)))
 
     def apply(
-        self, level: QualityLevel, pixels: float | int, num_waiting: int, has_company: bool = False
+        self, level: QualityLevel, pixels: float | int, num_waiting: int, has_other_viewers: bool = False
     ) -> QualityLevel:
         """The level, with a lower resolution if images of this many pixels for all waiting viewers would take too long.
 
-        `num_waiting` includes this viewer; `has_company` is whether others are connected, waiting or not.
+        `num_waiting` includes this viewer; `has_other_viewers` is whether others are connected, waiting or not.
         """
         seconds_per_px = max(self._seconds_per_px, default=DEFAULT_S_PER_PX) * _cost_per_px(level)
         image_s = seconds_per_px * pixels * level.scale**2
-        limit_s = MAX_WAIT_S / num_waiting if num_waiting > 1 else IDLE_WAIT_S if has_company else inf
+        limit_s = MAX_WAIT_S / num_waiting if num_waiting > 1 else IDLE_WAIT_S if has_other_viewers else inf
         return level if image_s <= limit_s else replace(level, scale=level.scale * sqrt(limit_s / image_s))
 
 

@@ -21,19 +21,22 @@ HELLO_S = 10.0
 """A client has this many seconds for its first message."""
 ACK_S = 30.0
 """A client has this many seconds to acknowledge a frame."""
-FAULTS_PER_S = 1.0
-"""A client may send this many malformed messages a second on average."""
-FAULTS_AT_ONCE = 19.0
-"""A client may send this many malformed messages at once."""
+REJECTED_PER_S = 1.0
+"""A client may send this many messages a second, on average, that are rejected: malformed, or too many."""
+REJECTED_AT_ONCE = 19.0
+"""A client may send this many such messages in a burst."""
 STATE_S = 300.0
-"""A state is sent again after this many seconds even if nothing has changed: the clocks of pages drift."""
+"""The message `state` is repeated after this many seconds even if nothing has changed: pages' clocks drift."""
+RECENT_S = 2.0
+"""A viewer that was sent a frame within this many seconds is not idle."""
 
 
 @dataclass
 class ClosingError(Exception):
-    """Ends a connection."""
+    """Ends a connection with an error message."""
 
     code: int
+    """The WebSocket's close code."""
     message: str
 
 
@@ -44,45 +47,48 @@ async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
 
 
 @dataclass(frozen=True)
-class StateCauses:
-    """What the message `state` is computed from. It is not computed again while this stays the same."""
+class StateInputs:
+    """The inputs of the message `state`, which is computed again when one of them has changed."""
 
     shared: SharedState
     clock_changes: int
+    """How often the viewer has changed its clock."""
     buffering: bool
 
 
 @dataclass(frozen=True)
-class UnpredictedState:
-    """The part of the message `state` that a page cannot compute from the last one.
+class StateNews:
+    """The part of the message `state` that a page cannot compute from the previous message.
 
-    The message is not sent again while this stays the same.
+    The message is sent again when this part has changed.
     """
 
     source: dict[str, Any]
+    """The fields that are the same for all viewers."""
     clock_changes: int
-    own: dict[str, Any]
-    """The viewer's own fields, without those that change as its clock runs."""
+    """How often the viewer has changed its clock."""
+    viewer: dict[str, Any]
+    """The fields of this viewer, without those that change as its clock runs."""
 
 
 @dataclass
 class SentMessages:
-    """What a viewer was sent last."""
+    """The last messages of each type that a viewer was sent."""
 
     rig: dict[str, Any] | None = None
     show: dict[str, Any] | None = None
-    causes: StateCauses | None = None
-    state: UnpredictedState | None = None
+    state_inputs: StateInputs | None = None
+    state: StateNews | None = None
     state_s: float = -math.inf
     """The time of the last message `state`; -inf before the first."""
     stats_s: float = -math.inf
     """The time of the last message `stats`; -inf before the first."""
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
-    completed: int = 0
-    """`SharedState.completed` when completed views were last listed."""
-    listed_views: dict[FrameKey, int] = field(default_factory=dict)
-    """The number of completed views that were listed for each frame."""
+    made_ahead: int = 0
+    """`SharedState.made_ahead` at the last message `completed`."""
+    listed: dict[FrameKey, int] = field(default_factory=dict)
+    """The number of meshes and completed views of each frame at that time."""
 
 
 class ViewerConnection:
@@ -96,13 +102,14 @@ class ViewerConnection:
         self._loop = asyncio.get_running_loop()
         self._wake_writer = asyncio.Event()
         self._pending: dict[str, dict[str, Any]] = {}
-        """Messages that wait for the writer, by name."""
+        """JSON messages that wait for the writer, by the names that `_send_soon` gives them."""
         self._frame: bytes | None = None
         """The frame that waits for the writer."""
         messages_per_s = registry.limits.messages_per_s
         self._messages = RateLimit(messages_per_s, 2 * messages_per_s, self._now)
-        self._faults = RateLimit(FAULTS_PER_S, FAULTS_AT_ONCE, self._now)
+        self._rejected = RateLimit(REJECTED_PER_S, REJECTED_AT_ONCE, self._now)
         self._failed: asyncio.Future[None] = self._loop.create_future()
+        """Set by `fail`; ends the connection with its exception."""
         self._sent = SentMessages()
         ladder = registry.service.renderer.ladder
         self._session = ViewerSession(
@@ -168,13 +175,13 @@ class ViewerConnection:
         try:
             done, _ = await asyncio.wait([*tasks, self._failed], return_when=asyncio.FIRST_COMPLETED)
         finally:
-            del self._registry.connections[self]
+            self._registry.leave(self)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         for task in done:
             if not task.cancelled():
-                task.result()
+                task.result()  # raises the exception that ended the connection
 
     async def _receive(self) -> str:
         message = await self._socket.receive()
@@ -193,12 +200,13 @@ class ViewerConnection:
                     continue
                 await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
                 limit = self._registry.limits.messages_per_s
-                self._count_fault(4429, f"expected at most {limit} messages a second; send fewer")
+                self._reject(4429, f"expected at most {limit} messages a second; send fewer")
             except ProtocolError as error:
-                self._count_fault(4400, str(error))
+                self._reject(4400, str(error))
 
-    def _count_fault(self, code: int, message: str) -> None:
-        if not self._faults.allow():
+    def _reject(self, code: int, message: str) -> None:
+        """Answer a client's message with an error, or close the connection if there are too many."""
+        if not self._rejected.allow():
             raise ClosingError(code, message)
         self._send_soon(protocol.error_json(code, message, fatal=False))
 
@@ -218,12 +226,13 @@ class ViewerConnection:
                 extension.handle(self._session, message) for extension in self._registry.extensions
             ]
             if not handled_by_session and not any(handled_by_extension):
+                # All messages are for sessions, except `on_air`, which is for the broadcast.
                 raise ProtocolError(
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
             self._service.lock.notify_all()
         if isinstance(message, ClockChange):
-            self.inform(self._registry.shared_state())
+            self.send_due(self._registry.shared_state())
         self._registry.check_soon(self)
 
     def _update_session(self, message: Message) -> bool:
@@ -236,7 +245,7 @@ class ViewerConnection:
             case Ack():
                 self._session.ack(message.frame)
             case ClockChange():
-                self._session.change_clock(message, self._service.source.span, self._service.edge)
+                self._session.change_clock(message, self._service.source.span, self._service.advance_edge())
             case _:
                 return False
         return True
@@ -255,38 +264,42 @@ class ViewerConnection:
                     self._frame = None  # the render thread may set the next one while this one is sent
                     await self._socket.send_bytes(frame)
 
-    def inform(self, shared: SharedState) -> float:
-        """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
+    def send_due(self, shared: SharedState) -> float:
+        """Send the messages that are due, and end the connection if a frame was not acknowledged in time.
 
-        Returns the time from which it has to be called again, by the clock of the service. It is
-        called earlier if `shared` changes or the viewer sends a message.
+        Returns the time, by the service's clock, at which the registry has to call this again. It
+        does so earlier if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
         self._send_new_rig()
 
-        # Two changes do not show in the causes: a clock catches up with the live edge, and an
-        # extension has a new state.
-        catches_up = self._service.source.span.live and session.clock.playing and not session.clock.live
-        changes_by_itself = bool(self._registry.extensions) or catches_up
+        # The state. Two kinds of changes do not show in its inputs, so it is computed each time: the
+        # frame of a clock that plays behind the live edge, and the states of extensions.
+        plays_behind = self._service.source.span.live and session.clock.playing and not session.clock.live
+        changes_by_itself = bool(self._registry.extensions) or plays_behind
         is_overdue = now - self._sent.state_s >= STATE_S
-        causes = StateCauses(shared, session.clock_changes, session.buffering)
-        if causes != self._sent.causes or changes_by_itself or is_overdue:
-            self._sent.causes = causes
-            self._send_state(causes)
+        inputs = StateInputs(shared, session.clock_changes, session.buffering)
+        if inputs != self._sent.state_inputs or changes_by_itself or is_overdue:
+            self._sent.state_inputs = inputs
+            self._send_state(inputs)
 
+        # A view that the serving program wants shown, statistics, and what was made ahead
         if self._sent.rig is not None and shared.show and shared.show is not self._sent.show:
             self._sent.show = shared.show
             self._send_soon(shared.show)
         self._send_statistics(shared.viewers)
-        if shared.completed != self._sent.completed:
-            self._sent.completed = shared.completed
-            self._send_completed()
+        if shared.made_ahead != self._sent.made_ahead:
+            self._sent.made_ahead = shared.made_ahead
+            self._send_made_ahead()
+
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
 
-        # An idle viewer needs nothing before the state is repeated; others are checked again soon.
-        gets_views = session.wants_views or session.in_flight is not None or session.sent_since(now - 2)
+        # An idle viewer needs nothing until its state is repeated; any other is due at every check.
+        gets_views = (
+            session.wants_views or session.in_flight is not None or session.sent_since(now - RECENT_S)
+        )
         is_idle = self._sent.viewers == shared.viewers and not changes_by_itself and not gets_views
         return self._sent.state_s + STATE_S if is_idle else now
 
@@ -295,41 +308,44 @@ class ViewerConnection:
         if not self._failed.done():
             self._failed.set_exception(error)
 
-    def _send_state(self, causes: StateCauses) -> None:
-        """Send a state, unless the page can compute it from the last one."""
+    def _send_state(self, inputs: StateInputs) -> None:
+        """Send the message `state`, unless the page can compute it from the previous one."""
         source = self._service.source
         now = self._now()
         with self._service.lock:
-            own = self._session.state_json(source.span, self._service.edge)
+            viewer = self._session.state_json(source.span, self._service.advance_edge())
         for extension in self._registry.extensions:
-            own |= extension.state_json(self._session)
+            viewer |= extension.state_json(self._session)
 
-        # A page moves the clock of a recording by itself, but cannot know when a live rig's frames arrive.
-        predicted = ("behind",) if source.span.live else ("time", "behind")
-        unpredicted = {key: value for key, value in own.items() if key not in predicted}
-        state = UnpredictedState(causes.shared.source, causes.clock_changes, unpredicted)
-        if state != self._sent.state or now - self._sent.state_s >= STATE_S:
-            self._sent.state = state
+        # A page advances the clock of a recording by itself, but cannot know when a live rig's frames arrive.
+        computed_by_page = ("behind",) if source.span.live else ("time", "behind")
+        viewer_news = {key: value for key, value in viewer.items() if key not in computed_by_page}
+        news = StateNews(inputs.shared.source, inputs.clock_changes, viewer_news)
+        if news != self._sent.state or now - self._sent.state_s >= STATE_S:
+            self._sent.state = news
             self._sent.state_s = now
-            self._send_soon({"type": "state"} | causes.shared.source | own)
+            self._send_soon({"type": "state"} | inputs.shared.source | viewer)
 
-    def _send_completed(self) -> None:
-        """List what was made ahead for each frame that has more or less of it than was listed before."""
+    def _send_made_ahead(self) -> None:
+        """Send a message `completed` for each frame whose meshes and completed views have changed."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
-            if self._sent.listed_views.get(key) != count:
+            if self._sent.listed.get(key) != count:
                 index, without = key
-                cameras = [image.camera for image in self._service.ahead.images(key)]
-                mesh = self._service.ahead.mesh(key) is not None
-                about = {"type": "completed", "time": index, "without": without}
-                message = about | {"cameras": cameras, "mesh": mesh}
+                message = {
+                    "type": "completed",
+                    "time": index,
+                    "without": without,
+                    "cameras": [image.camera for image in self._service.ahead.images(key)],
+                    "mesh": self._service.ahead.mesh(key) is not None,
+                }
                 self._send_soon(message, f"completed {key}")
-        self._sent.listed_views = counts
+        self._sent.listed = counts
 
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
-        # Statistics are about the last second, so they change until one second after the last frame.
+        # A frame changes the statistics twice: when it is sent, and one second later, when it drops out of them.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now
@@ -343,9 +359,9 @@ class ViewerConnection:
             self._send_soon({"type": "rig"} | rig)
 
     def _send_soon(self, message: dict[str, Any], name: str | None = None) -> None:
-        """Queue a message; one with the same name that is still waiting is replaced.
+        """Queue a message for the writer, in place of one with the same name that is still waiting.
 
-        The name is the message's type by default.
+        By default, the name is the message's type.
         """
         self._pending[name or message["type"]] = message
         self._wake_writer.set()

@@ -231,7 +231,7 @@ def encode_frame(
                 {"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed}
             )
     encode_ms = 1000 * (time.perf_counter() - start)
-    times = FrameTimes(**vars(result.times), encode=encode_ms, wait=wait_ms)
+    times = FrameTimes(encode=encode_ms, wait=wait_ms) + result.times
     first = result.completed[0].view
     header: dict[str, Any] = {
         "look": look.id,

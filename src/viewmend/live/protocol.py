@@ -247,6 +247,11 @@ class FrameTimes(StageTimes):
     wait: float = 0.0
     """Time from the arrival of a look to the start of its first frame."""
 
+    @property
+    def shares_geometry(self) -> bool:
+        """Whether the frame's geometry was computed before, for another view."""
+        return self.geometry == 0
+
     def as_json(self, frames: int = 1) -> dict[str, float]:
         """The protocol's `stage_ms`; means if this is the sum of several frames."""
         return {name: round(ms / frames, 2) for name, ms in (vars(self) | {"total": self.total}).items()}

@@ -1,4 +1,4 @@
-"""The viewers of a server: their sessions, and the task that informs their connections of changes."""
+"""The viewers of a server: their sessions, and the task that lets their connections send what is due."""
 
 import asyncio
 import contextlib
@@ -26,20 +26,20 @@ class SharedState:
     source: dict[str, Any]
     """The shared fields of the message `state`."""
     show: dict[str, Any] | None
-    """The message `show` that moves all pages; None if there was none."""
+    """The message `show`: a view that the serving program wants all pages to show; None if there was none."""
     rig: dict[str, Any] | None
     """The message `rig`; None before the first frame."""
     viewers: int
     """The number of connected viewers."""
-    completed: int
-    """The number of views that were completed ahead so far."""
+    made_ahead: int
+    """The number of meshes and completed views that were made ahead so far."""
 
 
 @runtime_checkable
-class Listener(Protocol):
+class Connection(Protocol):
     """A connection, as the registry sees it."""
 
-    def inform(self, shared: SharedState) -> float:
+    def send_due(self, shared: SharedState) -> float:
         """Send what is due; returns the time of the next call, which comes earlier if the shared state changes."""
         ...
 
@@ -59,23 +59,28 @@ class SessionRegistry:
     """Fields of the message `welcome` that are the same for all viewers."""
     extensions: Sequence[Extension] = ()
     sessions: list[ViewerSession] = field(default_factory=list)
-    connections: dict[Listener, float] = field(default_factory=dict)
+    connections: dict[Connection, float] = field(default_factory=dict)
     """Each connection after its `hello`, with the time of its next check; a change is sent earlier."""
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     shown: dict[str, Any] | None = None
     """The message `show` that moves all pages, also those that are opened later; set on any thread."""
 
-    _informer: "asyncio.Task[None] | None" = None
+    _sender: "asyncio.Task[None] | None" = None
+    """Runs `_send_to_all` while there are connections."""
 
-    def join(self, connection: Listener) -> None:
-        """Inform a viewer from now on."""
+    def join(self, connection: Connection) -> None:
+        """Let a connection send what is due, now and from now on."""
         shared = self.shared_state()
-        self.connections[connection] = connection.inform(shared)
-        if self._informer is None or self._informer.done():
-            self._informer = asyncio.create_task(self._inform_all(shared))
+        self.connections[connection] = connection.send_due(shared)
+        if self._sender is None or self._sender.done():
+            self._sender = asyncio.create_task(self._send_to_all(shared))
 
-    async def _inform_all(self, shared: SharedState) -> None:
-        """Let all connections send what is due, while there are any; they have been informed of `shared`."""
+    def leave(self, connection: Connection) -> None:
+        """Forget a connection that has ended."""
+        del self.connections[connection]
+
+    async def _send_to_all(self, shared: SharedState) -> None:
+        """Let all connections send what is due, while there are any; they already know the state `shared`."""
         news = asyncio.Event()
         loop = asyncio.get_running_loop()
 
@@ -93,22 +98,22 @@ class SessionRegistry:
             now = self.service.now()
             for connection, due_s in list(self.connections.items()):
                 if has_changed or due_s <= now:
-                    self._inform(connection, shared)
+                    self._send_due(connection, shared)
             if self.service.source.span.live:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(news.wait(), LIVE_TICK_S)
             else:
                 await asyncio.sleep(TICK_S)
 
-    def _inform(self, connection: Listener, shared: SharedState) -> None:
-        """Inform one connection; an error ends this connection only."""
+    def _send_due(self, connection: Connection, shared: SharedState) -> None:
+        """Let one connection send what is due; an error ends this connection only."""
         try:
-            self.connections[connection] = connection.inform(shared)
+            self.connections[connection] = connection.send_due(shared)
         except Exception as error:
             connection.fail(error)
 
-    def check_soon(self, connection: Listener) -> None:
-        """Inform this connection at the next check."""
+    def check_soon(self, connection: Connection) -> None:
+        """Let this connection send what is due at the next check."""
         self.connections[connection] = 0.0
 
     def shared_state(self) -> SharedState:
@@ -119,7 +124,7 @@ class SessionRegistry:
             self.shown,
             service.renderer.rig_json,
             len(self.sessions),
-            service.ahead.changes,
+            service.ahead.num_made,
         )
 
     def source_json(self) -> dict[str, Any]:

@@ -166,7 +166,7 @@ class RenderJob(ABC, Generic[Result]):
         """Encode the view; returns the times of all stages."""
         start = time.perf_counter()
         self.encode(result)
-        return FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
+        return FrameTimes(encode=1000 * (time.perf_counter() - start)) + result.times
 
     @property
     def is_cancelled(self) -> bool:
@@ -174,7 +174,7 @@ class RenderJob(ABC, Generic[Result]):
         return self.done.done()
 
     def give_up(self) -> None:
-        """Nothing is left to do after a cancellation."""
+        """Do nothing: a job is cancelled only when its client has gone."""
 
     def finish(self, result: Result) -> None:
         """Set the result, unless the job was cancelled."""

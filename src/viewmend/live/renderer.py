@@ -300,13 +300,13 @@ class Renderer:
         return proxy.to("cpu")
 
     @property
-    def fuses_ahead(self) -> bool:
-        """Whether meshes fused from predicted depth are made ahead, as completed views are."""
+    def makes_meshes_ahead(self) -> bool:
+        """Whether meshes fused from predicted depth are made ahead, in addition to completed views."""
         return self._completed_cameras > 0 and self._depth_model is not None
 
     def fuse_mesh(self, index: int, without: tuple[str, ...]) -> Asset:
         """A frame's mesh, fused from its hull and predicted depth; errors as `render`."""
-        assert self._depth_model is not None, "see `fuses_ahead`"
+        assert self._depth_model is not None, "see `makes_meshes_ahead`"
         left_out = self.left_out(without)
         cached = self._add_frame(self._stream_of(None, left_out), index, left_out)
         masks = all_masks(cached.frame)

@@ -19,22 +19,25 @@ from viewmend.utils.cancellation import CancelledError, cancellable
 from viewmend.utils.heap import HeapTrimmer
 
 TICK_S = 0.004
-"""Seconds between checks of the sessions' clocks."""
+"""Seconds between checks whether a session needs a view."""
 LOADING_S = 0.05
 """Seconds between these checks before the first frame."""
 IDLE_S = 0.5
-"""Seconds between these checks while no session wants a view; the first that does wakes the thread."""
+"""Seconds between these checks while no session wants views; the first that does wakes the thread."""
 AFTER_ERROR_S = 0.5
 """Seconds of rest after an error."""
 Session = ViewerSession | RenderJob[Any]
-"""What requests views. The render thread makes all calls, and holds the service's lock in all of
-them but `deliver` and `is_cancelled`."""
+"""A viewer or a job, for which the render thread renders. This thread calls `next_request` while it
+holds the service's lock, and `deliver`, `give_up` and `fail` without it."""
 
 log = logging.getLogger("viewmend.live")
 
 
 class RenderService:
-    """Owns the renderer and its thread. Sessions are changed while holding `lock`; `now` is the clock of all."""
+    """Owns the renderer and its thread.
+
+    Connections hold `lock` while they change sessions. All times are on the clock `now`, in seconds.
+    """
 
     def __init__(
         self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic
@@ -50,12 +53,13 @@ class RenderService:
         self.ahead = CompletedAhead(renderer)
         """Completed virtual cameras of the frames that pages draw."""
         self.counts = Counter(frames=0, shared=0, errors=0, cancelled=0)
+        """Events since the start, for /metrics."""
         self.times = FrameTimes()
-        """Times of all frames together; like the counts, for /metrics."""
+        """The summed times of all frames, for /metrics."""
         self._sessions: list[Session] = []
         self._resolution_limit = ResolutionLimit()
         self._stopped = False
-        self._advanced_at = now()
+        self._edge_advanced_s = now()
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
         source.changed = self.wake
 
@@ -74,13 +78,13 @@ class RenderService:
             self._thread.join(timeout=5)
 
     def wake(self) -> None:
-        """Check at once whether a session needs a view."""
+        """Note that the source has changed: check at once whether a session needs a view, and call `changed`."""
         with self.lock:
             self.lock.notify_all()
         self.changed()
 
     def join(self, session: Session) -> None:
-        """Begin to serve a session."""
+        """Start serving a session."""
         with self.lock:
             self._sessions.append(session)
             self.lock.notify_all()
@@ -101,20 +105,22 @@ class RenderService:
         """Whether views can be rendered."""
         return self.renderer.home is not None and self.renderer.is_prepared_for(self.source.rig)
 
-    @property
-    def edge(self) -> float:
-        """The position of all who follow the edge, now."""
+    def advance_edge(self) -> float:
+        """Advance the edge to now, and return it: the frame that all viewers who follow it are shown, with fractions.
+
+        This is the newest frame of a live rig, or the common playback position in a recording.
+        """
         with self.lock:
             now = self.now()
-            self.source.recording.advance(now - self._advanced_at, self.source.span)
-            self._advanced_at = now
+            self.source.recording.advance(now - self._edge_advanced_s, self.source.span)
+            self._edge_advanced_s = now
             return self.source.edge
 
     def _run(self) -> None:
         trimmer = HeapTrimmer()
         while not self._stopped:
             try:
-                worked = self._prepare() or self.serve_next() or self.complete_ahead()
+                worked = self._prepare() or self.serve_next() or self.make_ahead()
             except Exception as error:  # the thread goes on
                 log.warning("while preparing: %s", error)
                 self.error = f"{type(error).__name__}: {error}"[:400]
@@ -127,21 +133,22 @@ class RenderService:
                     self.lock.wait(self._check_interval_s())
 
     def _check_interval_s(self) -> float:
-        """Seconds until the sessions are checked again, if nothing wakes the thread."""
+        """Seconds until the sessions are checked again, unless something wakes the thread before."""
         if self._has_requests:
             return TICK_S
         return IDLE_S if self.is_ready else LOADING_S
 
     def _prepare(self) -> bool:
+        """Prepare the renderer for a new rig, once there is a frame; returns whether it did so."""
         span = self.source.span
         if self.is_ready or span.end <= span.first:
             return False
         try:
-            done = self.renderer.prepare(span.newest if span.live else span.first)
+            is_prepared = self.renderer.prepare(span.newest if span.live else span.first)
         except FrameNotReadyError:
             return False
         self.error = None
-        return done
+        return is_prepared
 
     def serve_next(self) -> bool:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
@@ -172,61 +179,62 @@ class RenderService:
             session.fail(self.error)
             return True
         self.error = None
-        self.counts.update(frames=1, shared=int(times.geometry == 0))
+        self.counts.update(frames=1, shared=int(times.shares_geometry))
         self.times += times
         return True
 
-    def complete_ahead(self) -> bool:
-        """Complete one virtual camera of a frame that is shown; False if there is none, or a viewer waits.
+    def make_ahead(self) -> bool:
+        """Make one mesh or completed view of a frame that a page shows; False if there is nothing to make.
 
-        It is given up as soon as a viewer asks for a view, or the frame is no longer shown.
-        Called on the render thread.
+        Nothing is made ahead while a viewer or a job needs a view. What is being made is cancelled as
+        soon as one does, or no page shows the frame any more. Called on the render thread.
         """
-        order = self.ahead.choose(self._shown_frames())
-        if order is None or self.source.read(order.key[0]) is None:
+        task = self.ahead.choose(self._frames_to_enrich())
+        if task is None or self.source.read(task.frame) is None:
             return False
 
         def is_needless() -> bool:
-            return self._stopped or order.key not in [view.key for view in self._shown_frames()]
+            return self._stopped or task.key not in [shown.key for shown in self._frames_to_enrich()]
 
         try:
             with cancellable(is_needless):
-                self.ahead.make(order)
+                self.ahead.make(task)
         except CancelledError:
             pass
         except Exception as error:
-            self.ahead.give_up(order, error)
+            self.ahead.note_failure(task, error)
         self.changed()
         return True
 
-    def _shown_frames(self) -> list[ShownFrame]:
-        """What viewers' pages show; nothing while a viewer waits for a view."""
+    def _frames_to_enrich(self) -> list[ShownFrame]:
+        """The frames that pages show; none while a viewer or a job needs a view, which takes precedence."""
         home = self.renderer.home
         if home is None or not self.is_ready:
             return []
         span = self.source.span
-        shown = []
+        frames = []
         with self.lock:
-            edge = self.edge
+            edge = self.advance_edge()
             for session in self._sessions:
-                if not isinstance(session, ViewerSession) or not session.is_content(span, edge):
+                is_job = not isinstance(session, ViewerSession)  # a job needs views until it leaves
+                if is_job or not session.is_up_to_date(span, edge):
                     return []
-                view = session.shown_frame(span, edge, home)
-                if view is not None:
-                    shown.append(view)
-        return shown
+                shown = session.shown_frame(span, edge, home)
+                if shown is not None:
+                    frames.append(shown)
+        return frames
 
     def _next_request(self, now: float, span: Span, home: HomeView) -> tuple[Session, RenderRequest] | None:
-        """The request of the session that has waited longest, which goes to the end of the queue."""
+        """The first request in the order of the queue; its session moves to the end."""
         viewers = [session for session in self._sessions if isinstance(session, ViewerSession)]
         playback = PlaybackState(
             span,
-            self.edge,
+            self.advance_edge(),
             home,
             has_frame=lambda index: self.source.read(index) is not None,
             active_viewers=max(1, sum(viewer.is_active(now) for viewer in viewers)),
             resolution_limit=self._resolution_limit,
-            has_company=len(viewers) > 1,
+            has_other_viewers=len(viewers) > 1,
         )
         for session in list(self._sessions):
             try:

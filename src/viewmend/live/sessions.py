@@ -20,42 +20,42 @@ from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
 
 STILL_S = 0.25
-"""A view that has been still for this many seconds is rendered again, sharp and quickly."""
+"""A view that has been still for this many seconds is rendered again at the level `Ladder.still`."""
 FULL_S = 0.8
 """A view that has been still for this many seconds is rendered again at full quality."""
 MAX_AWAITED_S = 10.0
-"""Playback waits at most this many seconds for a frame that its clock has passed."""
+"""A playing viewer waits at most this many seconds for a frame to be read, while its clock runs on."""
 
 
 @dataclass(frozen=True)
 class PlaybackState:
-    """What sessions choose their next view from."""
+    """The source's frames and the server's load, from which sessions choose their next views."""
 
     span: Span
     edge: float
-    """Position of the viewers that follow the edge."""
+    """Playback position, in frames, of all viewers that follow the edge."""
     home: HomeView
     has_frame: Callable[[int], bool]
-    """Whether a frame is in memory; the call requests it if it is not."""
+    """Returns whether a frame is in memory, and requests it from the source if it is not."""
     active_viewers: int
-    """Viewers that were sent a frame within the last second or wait for one, including this one."""
+    """The number of viewers that were sent a frame within the last second or wait for one; at least 1."""
     resolution_limit: ResolutionLimit = field(default_factory=ResolutionLimit)
-    has_company: bool = False
-    """Whether several viewers are connected, active or not."""
+    has_other_viewers: bool = False
+    """Whether more than one viewer is connected, active or not."""
 
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """What a page shows now."""
+    """The frame that a viewer's page shows, and how."""
 
     time: int
     """The frame's index."""
     without: tuple[str, ...]
     """Cameras that are not used."""
     eye: Cameras | None
-    """The camera of the viewer's last view; None if there was none yet."""
-    frame_s: float
-    """Seconds until the next frame is shown; infinite while the clock is paused."""
+    """The camera of the viewer's last look; None before the first."""
+    interval_s: float
+    """Seconds from one frame to the next; infinite while the clock is paused."""
 
     @property
     def key(self) -> FrameKey:
@@ -65,7 +65,7 @@ class ShownFrame:
 
 @dataclass(frozen=True)
 class SentFrame:
-    """One sent frame, for statistics."""
+    """A frame that was sent, for statistics."""
 
     sent_s: float
     times: FrameTimes
@@ -74,24 +74,26 @@ class SentFrame:
 
 @dataclass(frozen=True)
 class RequestedView:
-    """The view of a session's last request."""
+    """The view that a session requested last."""
 
     look: Look | None = None
+    """None before the first request."""
     index: int = -1
     """The frame's index; -1 before the first request."""
 
 
 @dataclass(frozen=True)
 class AwaitedFrame:
-    """A frame that is being read for a session."""
+    """A frame that a session waits for."""
 
     index: int
     """The frame's index; -1 for none."""
     since_s: float
+    """When the session began to wait."""
 
 
 class ViewerSession:
-    """One viewer: the newest look replaces earlier ones, and one frame at a time waits for its acknowledgement."""
+    """One viewer: a new look replaces earlier ones, and one frame at a time waits for its acknowledgement."""
 
     def __init__(
         self,
@@ -101,9 +103,14 @@ class ViewerSession:
         ladder: Ladder = CONTEXT_LADDER,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin a session; `send` gets frames and `report_error` messages, on the render thread.
+        """Set up a session.
 
-        `budget_ms` is the time that a view may take if there are no other viewers; None for no limit.
+        Args:
+            send: called with each encoded frame, on the render thread.
+            report_error: called with each error message, on the render thread.
+            budget_ms: the time that a view may take if there are no other viewers; None for no limit.
+            ladder: the model's quality levels.
+            now: the service's clock, in seconds.
         """
         self.viewer: State | None = None
         self.clock = Clock()
@@ -113,105 +120,108 @@ class ViewerSession:
         """Looks and frames that were replaced before they were rendered."""
         self.recent: deque[SentFrame] = deque(maxlen=120)
         self.in_flight: int | None = None
-        """The frame that is not acknowledged yet."""
+        """The number of the frame that was sent and not yet acknowledged; None if there is none."""
         self.in_flight_since = 0.0
         self.budget = None if budget_ms is None else Budget(budget_ms, ladder.levels)
         self.rendered_level = FULL
-        """The level of the last view, after the limit on its resolution."""
+        """The level of the requested view, as lowered by `ResolutionLimit`."""
         self._ladder = ladder
         self._send = send
         self._report_error = report_error
         self._now = now
         self._frame_numbers = count()
-        self.newest_look: Look | None = None
-        """The view to show; None before the first look, and after it was cancelled."""
+        self.wanted_look: Look | None = None
+        """The look to show; None before the first one, and after it was cancelled."""
         self._last_look: Look | None = None
-        """The last look, also if it was cancelled; None before the first."""
-        self._look_at = 0.0
-        self._advanced_at = now()
+        """The last look, even if it was cancelled; None before the first."""
+        self._look_arrived_s = 0.0
+        self._clock_advanced_s = now()
         self.requested = RequestedView()
         self.is_cancelled = False
-        """Whether the view that is being rendered is not needed any more."""
-        self._is_full = False
-        """Whether the requested view has the highest quality."""
-        self._is_refined = False
-        """Whether the requested view replaces one of the same look and frame."""
+        """Whether the result of the last request is no longer needed."""
+        self._is_final = False
+        """Whether no better view of the requested look and frame will be requested."""
+        self._is_refinement = False
+        """Whether the requested view repeats the previous look and frame at a better level."""
         self._awaited = AwaitedFrame(-1, 0.0)
-        self._level = FULL
-        """The level of the requested view, before the limit on its resolution."""
+        self._chosen_level = FULL
+        """The level of the requested view, before `ResolutionLimit` lowers it."""
         self._wait_ms = 0.0
-        """How long the requested look has waited."""
+        """Time from the arrival of the requested look to its request."""
         self._moving_px = 0.0
-        """Pixels of the last look that moved or played. The budget's scales are relative to these: a
-        view at rest may have more."""
+        """Pixels of the last look while the view moved or the clock played. Scales of the budget are
+        relative to this number; a look at rest may have more pixels."""
         self._encoders = Encoders()
 
     def look(self, look: Look) -> None:
-        """Set the view to show; a look that was not rendered yet is dropped."""
-        if self.newest_look is not self.requested.look:
+        """Set the look to show; an earlier one whose view was not requested yet is dropped."""
+        if self._has_new_look:
             self.dropped += 1
-        self.newest_look = look
+        self.wanted_look = look
         self._last_look = look
-        self._look_at = self._now()
-        self._cancel_final_view()
+        self._look_arrived_s = self._now()
+        self._cancel_view_at_rest()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
 
     def cancel(self) -> None:
         """Drop the look, and the view that is being rendered for it."""
-        self.newest_look = None
+        self.wanted_look = None
         self.is_cancelled = True
 
-    def _cancel_final_view(self) -> None:
-        """Cancel the view being rendered if only a viewer at rest needs it; views of a movement are finished."""
+    def _cancel_view_at_rest(self) -> None:
+        """Cancel the last request if its view was for a viewer at rest; while a viewer moves, all views are sent."""
         look = self.requested.look
-        self.is_cancelled |= look is not None and (look.full or self._is_refined)
+        self.is_cancelled |= look is not None and (look.full or self._is_refinement)
 
     def give_up(self) -> None:
-        """Forget a request that was cancelled, so that its view is rendered if it is still wanted."""
+        """Forget the last request, which was cancelled; its view is requested again if it is still wanted."""
         self.requested = RequestedView()
 
     @property
     def wants_views(self) -> bool:
-        """Whether there is a look; pages that draw by themselves have none while they move."""
-        return self.newest_look is not None
+        """Whether there is a look to show; pages that draw by themselves cancel theirs while they move."""
+        return self.wanted_look is not None
 
-    def is_content(self, span: Span, edge: float) -> bool:
-        """Whether no view has to be rendered: the newest look is shown at full quality, or the page draws itself."""
-        look = self.newest_look
-        if look is None:
+    @property
+    def _has_new_look(self) -> bool:
+        """Whether no view of the wanted look was requested yet. A repeated look is a new one."""
+        return self.wanted_look is not None and self.wanted_look is not self.requested.look
+
+    def is_up_to_date(self, span: Span, edge: float) -> bool:
+        """Whether no view is left to render: the wanted look was rendered as well as possible, or there is none."""
+        if self.wanted_look is None:
             return True
-        shown = self.requested
-        return look is shown.look and self.frame(span, edge) == shown.index and self._is_full
+        is_requested = not self._has_new_look and self.advance_clock(span, edge) == self.requested.index
+        return is_requested and self._is_final
 
     def shown_frame(self, span: Span, edge: float, home: HomeView) -> ShownFrame | None:
-        """What the page shows now; None before the first frame."""
-        index = self.frame(span, edge)
+        """The frame that the page shows now; None if there is none yet."""
+        index = self.advance_clock(span, edge)
         if index < 0:
             return None
         look = self._last_look
         eye = None if look is None else view_camera(look.cameras[0], home, (look.width, look.height))
         plays = self.clock.playing and span.fps > 0
-        frame_s = 1 / (span.fps * self.clock.speed) if plays else math.inf
-        return ShownFrame(index, () if look is None else look.without, eye, frame_s)
+        interval_s = 1 / (span.fps * self.clock.speed) if plays else math.inf
+        return ShownFrame(index, () if look is None else look.without, eye, interval_s)
 
-    def frame(self, span: Span, edge: float) -> int:
-        """The index of the frame to show now; -1 while there is none."""
+    def advance_clock(self, span: Span, edge: float) -> int:
+        """Advance the viewer's clock to now; returns the index of the frame to show, -1 while there is none."""
         now = self._now()
-        self.clock.advance(now - self._advanced_at, span, edge)
-        self._advanced_at = now
+        self.clock.advance(now - self._clock_advanced_s, span, edge)
+        self._clock_advanced_s = now
         return self.clock.frame(span)
 
     def change_clock(self, change: ClockChange, span: Span, edge: float) -> None:
         """Play, pause, seek, change the speed, or follow the edge."""
-        self.frame(span, edge)
+        self.advance_clock(span, edge)
         self.clock.change(change, span)
         self.clock_changes += 1
-        self._cancel_final_view()
+        self._cancel_view_at_rest()
 
     def is_active(self, now: float) -> bool:
-        """Whether a frame was sent within the last second, or the newest look waits for its first one."""
-        is_new = self.newest_look is not None and self.newest_look is not self.requested.look
-        return (is_new and self.in_flight is None) or self.sent_since(now - 1)
+        """Whether a frame was sent within the last second, or the viewer waits for the first view of a look."""
+        return (self._has_new_look and self.in_flight is None) or self.sent_since(now - 1)
 
     def sent_since(self, since_s: float) -> bool:
         """Whether a frame was sent after this moment."""
@@ -223,23 +233,23 @@ class ViewerSession:
             self.in_flight = None
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
-        """The newest look at the clock's frame, or the same view again at a better level; None for no view."""
+        """The wanted look at the clock's frame, or the same view again at a better level; None for no view."""
         self.buffering = False
-        look = self.newest_look
+        look = self.wanted_look
         if look is None or self.in_flight is not None:
             return None
-        due = self.frame(playback.span, playback.edge)
+        due = self.advance_clock(playback.span, playback.edge)
         if due < 0:
             return None
 
-        # the quality level; none if the same view was rendered as well already
-        is_new_look = look is not self.requested.look  # by identity: a repeated look is answered again
+        # Choose the quality level.
+        is_new_look = self._has_new_look
         is_new = is_new_look or due != self.requested.index
         level = self._next_level(look, is_new, now, playback)
         if level is None:
             return None
 
-        # the frame, or an earlier one that is still being read
+        # Choose the frame, and count the frames that playback skips.
         index = self._available_frame(due, now, playback)
         if index is None:
             self.buffering = True
@@ -247,15 +257,15 @@ class ViewerSession:
         if is_new and not is_new_look and self.clock.playing:
             self.dropped += max(0, index - self.requested.index - 1)
 
-        # the state of the new request
-        self._level = level
-        self._is_full = level == FULL
-        self._is_refined = not is_new
+        # Remember what is requested.
+        self._chosen_level = level
+        self._is_final = level == FULL
+        self._is_refinement = not is_new
         self.is_cancelled = False
         self.rendered_level = playback.resolution_limit.apply(
-            level, look.pixels, playback.active_viewers, playback.has_company
+            level, look.pixels, playback.active_viewers, playback.has_other_viewers
         )
-        self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
+        self._wait_ms = max(0.0, 1000 * (now - self._look_arrived_s)) if is_new_look else 0.0
         self.requested = RequestedView(look, index)
         return self._request(look, index, playback.home)
 
@@ -264,18 +274,24 @@ class ViewerSession:
     ) -> QualityLevel | None:
         """The level of a new view, or a better one for a view that is still; None if there is nothing to render."""
         plays = self.clock.playing and playback.span.fps > 0
-        at_rest = not look.moving and not plays
-        if is_new:
-            if not at_rest or not self._moving_px:
-                self._moving_px = look.pixels
-            return self._choose_level(look, playback.active_viewers)
-        return self._refine(now - self._look_at) if at_rest else None
+        is_at_rest = not look.moving and not plays
+        if not is_new:
+            return self._better_level(now - self._look_arrived_s) if is_at_rest else None
+        is_first = self._moving_px == 0
+        if is_first or not is_at_rest:
+            self._moving_px = look.pixels
+        return self._choose_level(look, playback.active_viewers)
 
     def _available_frame(self, due: int, now: float, playback: PlaybackState) -> int | None:
-        """The frame that is due, or an earlier one that is still being read; None while it is not in memory."""
+        """The frame to render if it is in memory; None while it is being read.
+
+        This is the frame that is due. A playing viewer that waits for an earlier frame keeps waiting
+        for that one, though: frames that are read too late for the clock would never be shown otherwise.
+        """
         awaited = self._awaited
-        keeps_waiting = self.clock.playing and playback.span.first <= awaited.index < due
-        index = awaited.index if keeps_waiting and now - awaited.since_s < MAX_AWAITED_S else due
+        is_behind = self.clock.playing and playback.span.first <= awaited.index < due
+        keeps_waiting = is_behind and now - awaited.since_s < MAX_AWAITED_S
+        index = awaited.index if keeps_waiting else due
         if playback.has_frame(index):
             self._awaited = AwaitedFrame(-1, now)
             return index
@@ -283,16 +299,17 @@ class ViewerSession:
             self._awaited = AwaitedFrame(index, now)
         return None
 
-    def _refine(self, still_s: float) -> QualityLevel | None:
-        """The level for a view that has been still for this long; None if it has been rendered as well already."""
-        if self._is_full:
+    def _better_level(self, still_s: float) -> QualityLevel | None:
+        """A better level than the requested one, for a view that has been still for this long; None if none is due."""
+        if self._is_final:
             return None
-        cost = self._level.relative_cost
+        cost = self._chosen_level.relative_cost
         steps = ((STILL_S, self._ladder.still), (FULL_S, FULL))
         better = [level for after_s, level in steps if still_s >= after_s and level.relative_cost > cost]
         return better[-1] if better else None
 
     def _choose_level(self, look: Look, active_viewers: int) -> QualityLevel:
+        """The level of the first view of a look or frame."""
         if look.full:
             return FULL
         if self.budget is None:
@@ -300,15 +317,17 @@ class ViewerSession:
             return level if look.adaptive else replace(level, scale=1.0)
         self.budget.target_ms = self.budget.budget_ms / active_viewers
         level = self.budget.level
-        scale = level.scale * min(1.0, 1 / self._enlargement(look)) if look.adaptive else 1.0
-        return replace(level, scale=scale)
+        if not look.adaptive:
+            return replace(level, scale=1.0)
+        # A larger image at rest first gets no more pixels than a moving one.
+        return replace(level, scale=level.scale / max(1.0, self._enlargement(look)))
 
     def _enlargement(self, look: Look) -> float:
-        """Ratio of the side lengths of this look's image to those of a moving one."""
+        """Side length of a look's image, relative to that of a moving view."""
         return math.sqrt(look.pixels / self._moving_px)
 
     def _request(self, look: Look, index: int, home: HomeView) -> RenderRequest:
-        level = self._level
+        level = self._chosen_level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
         quality = RenderQuality(
             mend=not COMPLETED_MODES.isdisjoint(look.modes),
@@ -335,12 +354,21 @@ class ViewerSession:
         self.viewer = result.viewer
         if self.is_cancelled:
             self.give_up()
-            return FrameTimes(**vars(result.times))
-        fields = {"frame": next(self._frame_numbers), "full": self._is_full, "dropped": self.dropped}
-        message, times = encode_frame(look, request, result, self._encoders, self._wait_ms, **fields)
+            return FrameTimes() + result.times
+        number = next(self._frame_numbers)
+        message, times = encode_frame(
+            look,
+            request,
+            result,
+            self._encoders,
+            self._wait_ms,
+            frame=number,
+            full=self._is_final,
+            dropped=self.dropped,
+        )
         self._encoders.key_frame = False
         self.record(look, times, len(message))
-        self.in_flight = fields["frame"]
+        self.in_flight = number
         self.in_flight_since = self._now()
         self._send(message)
         return times
@@ -353,20 +381,21 @@ class ViewerSession:
             self.budget.record(replace(level, scale=level.scale * self._enlargement(look)), times)
 
     def fail(self, message: str) -> None:
-        """Report an error once; the same view is not tried again."""
-        self._is_full = True
+        """Report an error once; the same view is not requested again."""
+        self._is_final = True
         self._report_error(message)
 
     def state_json(self, span: Span, edge: float) -> dict[str, Any]:
         """This viewer's part of the message `state`, under the service's lock."""
-        index = self.frame(span, edge)
+        index = self.advance_clock(span, edge)
         clock = self.clock
+        has_moving_edge = span.live or not span.complete
         return {
             "time": index,
             "playing": clock.playing,
             "speed": clock.speed,
             "live": clock.live,
-            "behind": max(0, int(edge) - index) if span.live or not span.complete else 0,
+            "behind": max(0, int(edge) - index) if has_moving_edge else 0,
             "buffering": self.buffering,
         }
 
@@ -382,6 +411,6 @@ class ViewerSession:
             "kb_per_frame": round(sum(sent.size_bytes for sent in recent) / 1000 / frames, 2),
             "dropped": self.dropped,
             "viewers": viewers,
-            "shared": round(sum(sent.times.geometry == 0 for sent in recent) / frames, 3),
+            "shared": round(sum(sent.times.shares_geometry for sent in recent) / frames, 3),
             "budget": None if self.budget is None else self.budget.as_json(),
         }

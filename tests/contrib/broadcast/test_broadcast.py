@@ -110,7 +110,7 @@ def test_the_viewer_on_air_controls_the_broadcast_view(on_air):
         second.on_air(False)
         wait_for_state(second, on_air=False)
         (extension,) = on_air.live.extensions
-        assert extension.session.newest_look.moving is False
+        assert extension.session.wanted_look.moving is False
     wait_for_background(on_air, GREEN)  # the last view stays after its viewer has left
 
 
@@ -270,7 +270,7 @@ def test_of_two_compared_modes_the_first_is_on_air():
     session = BroadcastSession(idle_service(), SIZE, None)
     session.look(Look(modes=("rendered", "completed"), moving=True, depth=True, scale=0.5))
     request = session.next_request(0.0, PLAYBACK)
-    assert session.newest_look.modes == ("rendered",) and not request.quality.mend
+    assert session.wanted_look.modes == ("rendered",) and not request.quality.mend
     assert tuple(request.cameras[0].size_px[0].tolist()) == SIZE
 
 

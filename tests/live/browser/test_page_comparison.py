@@ -25,7 +25,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         view.until(lambda: view.page.locator("#input-row").is_visible())
         view.page.keyboard.press("x")
         view.until(
-            lambda: session.newest_look is not None and session.newest_look.without == (NAME,), SCREENSHOT_S
+            lambda: session.wanted_look is not None and session.wanted_look.without == (NAME,), SCREENSHOT_S
         )
         view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
         assert texts(view, "left-name", "right-name") == ["Completed (views)", "Original"]
@@ -35,7 +35,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         view.until(lambda: f"without={NAME}" in view.page.url)
         view.page.get_by_role("button", name="Use all cameras").click()
         view.until(
-            lambda: session.newest_look is not None and session.newest_look.without == (), SCREENSHOT_S
+            lambda: session.wanted_look is not None and session.wanted_look.without == (), SCREENSHOT_S
         )
         view.until(lambda: view.page.locator("#error-name").is_hidden())
 
@@ -78,11 +78,11 @@ def test_two_models_are_compared(browser, ball):
         (session,) = ball.live.registry.sessions
         view.until(
             lambda: (
-                session.newest_look is not None and session.newest_look.modes == ("completed", "compared")
+                session.wanted_look is not None and session.wanted_look.modes == ("completed", "compared")
             ),
             SCREENSHOT_S,
         )
-        assert session.newest_look.model == "paper-small"
+        assert session.wanted_look.model == "paper-small"
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         assert texts(view, "right-name") == ["Completed (paper-small)"] and ball.service.error is None
 

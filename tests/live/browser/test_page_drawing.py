@@ -42,7 +42,7 @@ def drawn(view: View, time: int = 0) -> np.ndarray:
     """The canvas, once all cameras' images are there and the view rests."""
     session = view.server.live.registry.sessions
     view.until(
-        lambda: view.data("drawn") == str(time) and session and session[0].newest_look is not None,
+        lambda: view.data("drawn") == str(time) and session and session[0].wanted_look is not None,
         SCREENSHOT_S,
     )
     view.page.wait_for_timeout(300)
@@ -51,7 +51,7 @@ def drawn(view: View, time: int = 0) -> np.ndarray:
 
 def rendered(server: Running, time: int, mode: str = "rendered") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the server renders for the page's last look: the picture, its holes and its mask."""
-    look = server.live.registry.sessions[0].newest_look
+    look = server.live.registry.sessions[0].wanted_look
     renderer = server.service.renderer
     camera = view_camera(look.camera, renderer.home, (look.width, look.height))
     result = renderer.render(RenderRequest(time, (camera,), RenderQuality(mend=mode == "completed")), None)
@@ -138,7 +138,7 @@ def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, 
         view.page.mouse.move(x, y)
         view.page.mouse.down()
         view.page.mouse.move(x + 40, y)
-        view.until(lambda: session.newest_look is None)
+        view.until(lambda: session.wanted_look is None)
         looks, take = [], session.look
         session.look = lambda look: take(looks.append(look) or look)
         for step in range(10):
@@ -165,7 +165,7 @@ def test_playing_costs_the_server_no_views(browser, ball):
             return times >= {"0", "1", "2"}
 
         view.until(seen, SCREENSHOT_S)
-        wait_until(lambda: ball.live.registry.sessions[0].newest_look is None)
+        wait_until(lambda: ball.live.registry.sessions[0].wanted_look is None)
         before = ball.service.counts["frames"]
         times.clear()
         view.until(seen, SCREENSHOT_S)

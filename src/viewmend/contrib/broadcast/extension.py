@@ -88,7 +88,7 @@ class BroadcastSession(ViewerSession):
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the edge."""
-        if self.newest_look is None:
+        if self.wanted_look is None:
             home = playback.home
             self.look(Look(camera=Camera(azimuth=home.azimuth, elevation=home.elevation)))
         return super().next_request(now, playback)
@@ -105,7 +105,7 @@ class BroadcastSession(ViewerSession):
         with self._lock:
             if self._is_open:
                 self.image = image
-        times = FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
+        times = FrameTimes(encode=1000 * (time.perf_counter() - start)) + result.times
         self.record(look, times, size_bytes=0)
         return times
 
@@ -146,10 +146,10 @@ class Broadcast(Extension):
             self._director = session
         if (
             self._director is session
-            and session.newest_look is not None
+            and session.wanted_look is not None
             and isinstance(message, OnAir | Look)
         ):
-            self.session.look(session.newest_look)
+            self.session.look(session.wanted_look)
         return isinstance(message, OnAir)
 
     def leave(self, session: ViewerSession) -> None:
