@@ -23,7 +23,7 @@ from av.filter import Graph
 from measure import write
 from reference.films import MATRICES, picture, set_matrix, write_film
 
-from viewmend.contrib.live_rig.frame_readers import Playback, read_pictures
+from viewmend.contrib.live_rig.frame_readers import Playback, read_images
 from viewmend.data.videos import VideoFile, to_rgb, video_properties
 
 COUNT = 24
@@ -109,15 +109,15 @@ def by_filters(path: Path, matrix: tuple[int, int, int, int]) -> np.ndarray:
 class AtOnce(Playback):
     """Nothing is due yet, so nothing is too late."""
 
-    def lap(self, now_s: float) -> tuple[float, float]:
-        return now_s + 3600, 0.0
+    def lap_start_s(self, now_s: float) -> float:
+        return now_s + 3600
 
 
 def live(path: Path, count: int) -> np.ndarray:
     """All frames, (time, height, width, 3), as a live rig plays them; a lap takes no time."""
     playback = AtOnce(1e9)
     camera: Any = SimpleNamespace(name="a", url=str(path), is_file=True, offset_s=0.0)
-    with closing(read_pictures(camera, Counter(), playback, lambda seconds: False)) as pictures:
+    with closing(read_images(camera, Counter(), playback, lambda seconds: False)) as pictures:
         return np.stack([to_rgb(played.frame) for played in islice(pictures, count)])
 
 

@@ -73,7 +73,7 @@ def test_files_lie_beside_the_rig_and_pictures_are_made_smaller(folder):
     camera = rig.cameras[0]
     assert camera.url == str(folder / "take/video/left.mp4") and camera.is_file
     assert camera.plate == folder / "plates/left.png"
-    assert camera.taken_px == (640, 480) and (camera.calibration.width, camera.calibration.height) == (
+    assert camera.sent_px == (640, 480) and (camera.calibration.width, camera.calibration.height) == (
         320,
         240,
     )

@@ -132,16 +132,16 @@ def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
 
 def test_without_a_subject_the_background_is_shown(rig):
     supply, gone = RigFileSource(rig, align=False), threading.Event()
-    show = supply._show
+    add_group = supply._add_group
 
-    def show_with_or_without(group):
+    def add_with_or_without(group):
         if gone.is_set():
             for name, taken in group.by_camera.items():
                 images = replace(taken.images, mask=np.zeros_like(taken.images.mask))
                 group.by_camera[name] = replace(taken, images=images)
-        show(group)
+        add_group(group)
 
-    supply._show = show_with_or_without
+    supply._add_group = add_with_or_without
     with reading(supply):
         wait_until(lambda: of_all(supply) is not None)
         gone.set()

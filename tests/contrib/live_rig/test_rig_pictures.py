@@ -14,7 +14,7 @@ import pytest
 from reference.films import picture, set_matrix, write_film
 
 from viewmend.contrib.live_rig import frame_readers, frame_times
-from viewmend.contrib.live_rig.frame_readers import DamageFilter, Playback, read_pictures
+from viewmend.contrib.live_rig.frame_readers import DamageFilter, Playback, read_images
 from viewmend.contrib.live_rig.frame_times import ArrivalTimes, DriverTimes, SenderTimes
 from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.sender_clock import SenderClock
@@ -65,7 +65,7 @@ def playback(clock):
 
 
 def test_a_recording_is_played_in_time_over_and_over(camera, clock, playback):
-    with closing(read_pictures(camera, Counter(), playback, clock.wait)) as played:
+    with closing(read_images(camera, Counter(), playback, clock.wait)) as played:
         taken = [next(played) for _ in range(20)]
     assert [round(FPS * (p.taken_s - 1000)) for p in taken] == list(range(20))
     shades = [shade(p.frame) for p in taken]
@@ -74,7 +74,7 @@ def test_a_recording_is_played_in_time_over_and_over(camera, clock, playback):
 
 def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out(camera, clock, playback):
     clock.now += 8 / FPS + 0.31
-    with closing(read_pictures(camera, Counter(), playback, clock.wait)) as played:
+    with closing(read_images(camera, Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 + 1.2)
         clock.now += 0.25  # somebody was slow
         assert next(played).taken_s == pytest.approx(1000 + 1.4)
@@ -85,10 +85,10 @@ def test_recordings_keep_the_times_at_which_they_started():
         return Track(name, "images", start_s + np.arange(frames) / 10, 10.0)
 
     playback = Playback()
-    playback.follow([track("a", 5.0, 10), track("b", 5.3, 7)])
+    playback.synchronise([track("a", 5.0, 10), track("b", 5.3, 7)])
     assert playback.length_s == pytest.approx(1.0)
     assert playback.shifts_s == {"a": pytest.approx(-5.0), "b": pytest.approx(-5.0)}
-    playback.follow([track("a", 5.0, 10), track("b", 5.0, 9), track("c", 100.0, 10)])  # no common time
+    playback.synchronise([track("a", 5.0, 10), track("b", 5.0, 9), track("c", 100.0, 10)])  # no common time
     assert playback.length_s == pytest.approx(0.9) and playback.shifts_s["c"] == pytest.approx(-100.0)
 
 
@@ -97,7 +97,7 @@ def test_recordings_are_played_by_their_timecodes_and_this_is_said():
         return Track(name, "images", np.arange(10) / 10, 10.0, timecode=Timecode(clock_frames, 10))
 
     playback = Playback()
-    said = playback.follow([track("a", 36_000), track("b", 36_003)])
+    said = playback.synchronise([track("a", 36_000), track("b", 36_003)])
     assert playback.shifts_s == {"a": pytest.approx(0.0), "b": pytest.approx(0.3)}
     assert said is not None and "0.30 s apart (first 'a', last 'b'); they are matched by timecode" in said
 
@@ -109,14 +109,14 @@ def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
     shown = []
     for path in (upright, turned):
         with closing(
-            read_pictures(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)
+            read_images(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)
         ) as played:
             shown.append(to_rgb(next(played).frame))
     assert (np.rot90(shown[0], -1) == shown[1]).all()
 
 
 def test_an_offset_is_taken_off(camera, clock, playback):
-    with closing(read_pictures(replace(camera, offset_s=0.03), Counter(), playback, clock.wait)) as played:
+    with closing(read_images(replace(camera, offset_s=0.03), Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 - 0.03)
 
 
@@ -125,7 +125,7 @@ def test_an_offset_is_taken_off(camera, clock, playback):
 )
 def test_addresses_where_nothing_is_are_said_without_their_secrets(camera, url, said):
     with pytest.raises(OSError) as error:
-        next(read_pictures(replace(camera, url=url), Counter(), Playback(), bool))
+        next(read_images(replace(camera, url=url), Counter(), Playback(), bool))
     assert said in str(error.value) and "token" not in str(error.value)
 
 
@@ -221,7 +221,7 @@ def received_images(camera, stream, counts):
         network = replace(camera, url=url, clock="arrival")
         with (
             pytest.raises(OSError, match="ended"),
-            closing(read_pictures(network, counts, Playback(), bool)) as received,
+            closing(read_images(network, counts, Playback(), bool)) as received,
         ):
             shown.extend(picture.to_rgb() for picture in received)
     return shown

@@ -10,7 +10,7 @@ import pytest
 from live.live_servers import WAIT_S, wait_until
 from reference.ball_rig import CAMERAS
 
-from viewmend.contrib.live_rig.frame_readers import Picture
+from viewmend.contrib.live_rig.frame_readers import DecodedImage
 from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.worker import CameraWorker
 
@@ -46,7 +46,7 @@ def test_a_camera_that_fails_is_reached_again(camera):
         attempt = next(attempts)
         if attempt < 6:
             raise OSError("nobody there")
-        yield Picture(frame(), 10.0 + attempt)
+        yield DecodedImage(frame(), 10.0 + attempt)
         if attempt == 7:
             raise ZeroDivisionError("what a decoder may raise")
         if attempt == 8:
@@ -72,14 +72,15 @@ def test_pictures_of_another_size_are_refused_and_said(camera):
 
     def connect(worker):
         for n in range(3):
-            yield Picture(frame((64, 48)), float(n))
+            yield DecodedImage(frame((64, 48)), float(n))
             wait_until(lambda n=n: worker.counts["refused"] > n)
-        yield Picture(frame(), 3.0)
+        yield DecodedImage(frame(), 3.0)
         worker.wait(WAIT_S)
 
     with working(camera, connect, lambda *_: said.set()) as worker:
         assert said.wait(WAIT_S)
-    expected = "expected pictures of 48 x 48 as the calibration says, got 64 x 48; set the camera's mode in 'options'"
+    expected = "expected images of 48 x 48 pixels as the calibration says, got 64 x 48; "
+    expected += "set the camera's mode in 'options'"
     assert worker.counts["refused"] == 3 and worker.error == expected
 
 
@@ -88,15 +89,15 @@ def test_a_slow_mask_costs_pictures_and_never_delay(camera):
 
     def connect(worker):
         for n in range(50):
-            yield Picture(frame(), float(n))
+            yield DecodedImage(frame(), float(n))
         go_on.set()
         worker.wait(WAIT_S)
 
-    def images(picture):
+    def process(decoded):
         go_on.wait(WAIT_S)
 
     with working(
-        camera, connect, lambda name, taken_s, _: delivered.append(taken_s), _images=images
+        camera, connect, lambda name, taken_s, _: delivered.append(taken_s), _process=process
     ) as worker:
         wait_until(lambda: 49.0 in delivered)
     assert len(delivered) <= 2 and worker.counts["replaced"] == 50 - len(delivered)
@@ -107,7 +108,7 @@ def test_pictures_that_nobody_wants_are_not_masked(camera):
 
     def connect(worker):
         for n in range(20):
-            yield Picture(frame(), n / 10)
+            yield DecodedImage(frame(), n / 10)
         worker.wait(WAIT_S)
 
     with working(camera, connect, wants=lambda at_s, period_s: wanted.append(period_s)) as worker:

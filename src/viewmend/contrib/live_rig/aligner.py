@@ -1,4 +1,8 @@
-"""Synchronisation: groups the cameras' images, which arrive in any order, by the time at which they were taken."""
+"""Synchronisation: groups the cameras' images, which arrive in any order, by the time at which they were taken.
+
+The rig shows a frame at each of its ticks, which are evenly spaced in time. Each camera contributes
+the image that was taken closest to the tick.
+"""
 
 import math
 import statistics
@@ -11,11 +15,11 @@ from viewmend.data.camera_images import CameraImages
 ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""
 PHASE_GAIN = 0.05
-"""Each group moves the ticks by this fraction of its cameras' median offset."""
+"""The ticks follow the cameras: each group moves later ticks by this fraction of its images' median offset."""
 FAST_RATIO = 1.5
-"""A camera is fast if it takes at least this many images per tick; only those nearest to a tick are used."""
+"""A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""This many complete groups are kept until they are taken; the oldest are dropped."""
+"""Up to this many complete groups wait to be taken; the oldest are dropped if there are more."""
 
 
 @dataclass(frozen=True)
@@ -43,27 +47,34 @@ class ImageGroup:
 
 @dataclass(frozen=True)
 class NearestTick:
-    """The tick nearest to some time."""
+    """The tick nearest to an image."""
 
     number: int
     offset_s: float
-    """That time minus the tick's."""
+    """Time of the image, relative to the tick."""
 
 
 class Aligner:
     """Groups images by tick. One thread at a time may call it.
 
-    Ticks are evenly spaced and follow the cameras' own rate and phase. A tick is complete
-    when each camera has an image for it or a later one; absent cameras do not count. An
-    incomplete tick waits for `wait_s`.
+    A group is complete when each camera has sent an image for its tick or a later one. Cameras that
+    have been silent for `ABSENT_S` are not waited for.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
+        """Set up.
+
+        Args:
+            names: the cameras.
+            interval_s: time between two ticks.
+            tolerance_s: largest difference between the time of an image and its tick.
+            wait_s: how long an incomplete group waits for more images.
+        """
         self._interval_s = interval_s
         self._tolerance_s = tolerance_s
         self._wait_s = wait_s
         self._origin_s: float | None = None
-        """Time of tick 0."""
+        """Time of tick 0; None before the first image."""
         self._max_groups = MAX_COMPLETE + math.ceil(wait_s / interval_s)
         self._groups: dict[int, ImageGroup] = {}
         self._last_finished = -math.inf
@@ -71,11 +82,11 @@ class Aligner:
         self._last_tick: dict[str, float] = dict.fromkeys(names, -math.inf)
         """The last tick for which each camera sent an image."""
         self._heard_s: dict[str, float] = dict.fromkeys(names, -math.inf)
-        """When the last image of each camera arrived."""
+        """When each camera's last image arrived."""
         self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def wants(self, taken_s: float, period_s: float) -> bool:
-        """Whether an image may be used. Of a fast camera, only the nearest image to each tick is used.
+        """Whether an image may be used: of a fast camera, only the image nearest to each tick is.
 
         `period_s` is the time between two images of the camera.
         """
@@ -94,7 +105,9 @@ class Aligner:
         """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
         counts = self.counts[name]
         self._heard_s[name] = now_s
-        if timed.taken_s > now_s + self._interval_s / 2:  # a clock that jumps must not affect the others
+        if (
+            timed.taken_s > now_s + self._interval_s / 2
+        ):  # the camera's clock is wrong: no tick may depend on it
             counts["misaligned"] += 1
             return
         tick = self._nearest(timed.taken_s)
@@ -106,7 +119,7 @@ class Aligner:
             counts["misaligned"] += 1
             return
 
-        # of two images of one camera, the nearer one is kept
+        # Of two images of one camera, keep the one nearer to the tick.
         group = self._groups.setdefault(tick.number, ImageGroup(now_s))
         other = group.by_camera.get(name)
         if other is not None:
@@ -123,7 +136,9 @@ class Aligner:
             self._last_finished = oldest
 
     def take(self, now_s: float) -> list[ImageGroup]:
-        """Groups that are complete or have waited long enough, the oldest first."""
+        """Remove and return the groups that are complete or have waited long enough, the oldest first."""
+        if self._origin_s is None:
+            return []
         taken: list[ImageGroup] = []
         present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - ABSENT_S}
         for tick in sorted(self._groups):
@@ -138,7 +153,6 @@ class Aligner:
             for name in present - group.by_camera.keys():
                 self.counts[name]["missing"] += 1
             offsets_s = [self._nearest(timed.taken_s).offset_s for timed in group.by_camera.values()]
-            assert self._origin_s is not None, "an image has set it"
             self._origin_s += PHASE_GAIN * statistics.median(offsets_s)
             taken.append(group)
         return taken

@@ -32,9 +32,11 @@ MIN_WAIT_S = 0.002
 """If the reader waited longer than this for a packet, in seconds, the packet has just arrived;
 otherwise it may have been in a queue."""
 DAMAGED_S = 2.0
-"""Images after a damaged one are dropped until the next key frame, but no longer than this many seconds."""
+"""After a damaged image, all others are dropped until the next key frame, but at most for this many seconds."""
+ROUNDING_S = 1e-6
+"""Times of a recording that differ by less than this many seconds are the same."""
 FFMPEG_OPTIONS = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
-"""FFmpeg's options for all addresses: it examines little of a stream before the first image."""
+"""FFmpeg's options for all addresses: little of a stream is analysed, so that the first image comes soon."""
 SCHEME_OPTIONS = {
     "udp": {"overrun_nonfatal": "1"},
     "rtsp": {"rtsp_transport": "tcp"},
@@ -44,8 +46,8 @@ SCHEME_OPTIONS = {
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A decoded image, not yet converted."""
+class DecodedImage:
+    """A camera's image as FFmpeg's frame, not yet converted to RGB."""
 
     frame: "VideoFrame"
     taken_s: float
@@ -59,31 +61,33 @@ class Picture:
 
 
 class Playback:
-    """The common position of recordings that are played in a loop as if live."""
+    """The common timeline on which recordings are played in a loop, as if they were live."""
 
     def __init__(self, length_s: float = 1.0) -> None:
         self.start_s = time.monotonic()
         self.length_s = length_s
-        """The length of a lap, after which all recordings start again: that of the shortest recording."""
+        """The length of a lap, after which all recordings start again: up to the end of the first that ends."""
         self.shifts_s: dict[str, float] = {}
-        """Seconds to add to the times in each camera's recording, so that the earliest image of all is
-        at 0. A recording that is not listed is played alone, from its first image."""
+        """The position of each recording's time 0 on the timeline, in seconds; the earliest image of all
+        is at 0. A recording that is not listed begins with its first image at 0."""
 
-    def follow(self, tracks: Sequence[Track]) -> str | None:
-        """Play these recordings by their own times. Returns a note if their timecodes give them different starts.
+    def synchronise(self, tracks: Sequence[Track]) -> str | None:
+        """Put these recordings on the timeline by their timestamps, or their timecodes.
+
+        Returns a note for the user if their timecodes start at different times; None otherwise.
 
         Raises:
-            ValueError: no two of them show the same time.
+            ValueError: no two of them overlap in time.
         """
         clock = match_tracks(tracks)
         matched = clock.tracks
         first_s = min(float(track.times_s[0]) for track in matched)
         ends_s = [float(track.times_s[-1]) + 1 / (track.fps or 1.0) for track in matched]
         self.length_s = min(ends_s) - first_s
-        self.shifts_s = {
-            track.camera: float(moved.times_s[0] - track.times_s[0]) - first_s
-            for track, moved in zip(tracks, matched, strict=True)
-        }
+        self.shifts_s = {}
+        for original, shifted in zip(tracks, matched, strict=True):
+            shift_s = float(shifted.times_s[0] - original.times_s[0])
+            self.shifts_s[original.camera] = shift_s - first_s
         return clock.timecodes
 
     def lap_start_s(self, now_s: float) -> float:
@@ -91,13 +95,16 @@ class Playback:
         return now_s - (now_s - self.start_s) % self.length_s
 
 
-def read_pictures(
+def read_images(
     camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]
-) -> Generator[Picture, None, None]:
-    """Generate the images of a camera from now on, until it fails; close the generator after use.
+) -> Generator[DecodedImage, None, None]:
+    """Generate the images of a camera from now on, until it fails. The caller closes the generator.
 
-    Damaged ("torn") and "duplicated" images are counted in `counts`. Recordings are paced by
-    `wait(seconds)`, which returns True to end them.
+    Args:
+        camera: a live stream or a recording.
+        counts: counts a stream's damaged images as "torn", and repeated ones as "duplicated".
+        playback: the timeline of recordings.
+        wait: waits for some seconds before a recording's next image; returns True to end the recording.
 
     Raises:
         OSError: the camera cannot be opened, its stream ends, or it is silent.
@@ -105,7 +112,8 @@ def read_pictures(
     return _play_recording(camera, playback, wait) if camera.is_file else _receive_stream(camera, counts)
 
 
-def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Picture, None, None]:
+def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[DecodedImage, None, None]:
+    """A stream's undamaged images as they arrive."""
     import av
 
     with closing(_open_stream(camera)) as container:
@@ -127,20 +135,21 @@ def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Pic
             try:
                 frames = packet.decode()
             except av.InvalidDataError:
-                damage.note(arrived_s)
+                damage.note_damaged(arrived_s)
                 continue
             for frame in frames:
                 if not damage.accepts(frame, packet.is_corrupt, arrived_s) or not times.is_new(frame, counts):
                     continue
                 taken_s = times.taken_s(frame, arrived_s)
                 if taken_s is not None:
-                    yield Picture(frame, taken_s - camera.offset_s, first_field_of(stream.codec_context))
+                    first_field = first_field_of(stream.codec_context)
+                    yield DecodedImage(frame, taken_s - camera.offset_s, first_field)
 
 
 def _play_recording(
     camera: LiveCamera, playback: Playback, wait: Callable[[float], bool]
-) -> Generator[Picture, None, None]:
-    """A recording's images when they are due; overdue ones are skipped."""
+) -> Generator[DecodedImage, None, None]:
+    """A recording's images when they are due, lap after lap; overdue ones are skipped."""
     try:
         video = video_properties(Path(camera.url))
     except CaptureError as error:
@@ -148,23 +157,25 @@ def _play_recording(
     shift_s = playback.shifts_s.get(camera.name, -video.times_s[0])
     times_s = [time_s + shift_s for time_s in video.times_s]
 
-    # Begin where the other recordings are now, in the middle of a lap
+    # The first lap begins where the other recordings are now, later laps at position 0.
     now_s = time.monotonic()
-    lap_s = playback.lap_start_s(now_s)
-    position_s = now_s - lap_s
+    lap_start_s = playback.lap_start_s(now_s)
+    position_s = now_s - lap_start_s
     while True:
-        for index, frame in decode(video, bisect_left(times_s, position_s - 1e-6), threads=1):
-            due_s = lap_s + times_s[index]
-            if times_s[index] >= playback.length_s - 1e-6:
+        for index, frame in decode(video, bisect_left(times_s, position_s - ROUNDING_S), threads=1):
+            if times_s[index] >= playback.length_s - ROUNDING_S:
                 break
+            due_s = lap_start_s + times_s[index]
             if due_s < time.monotonic() - LATE_S:
                 continue
             if wait(due_s - time.monotonic()):
                 return
-            yield Picture(frame, due_s - camera.offset_s)
-        lap_s = max(lap_s + playback.length_s, playback.lap_start_s(time.monotonic()))
+            yield DecodedImage(frame, due_s - camera.offset_s)
+
+        # Go on with the next lap, or with the current one of the others if this camera has fallen behind.
+        lap_start_s = max(lap_start_s + playback.length_s, playback.lap_start_s(time.monotonic()))
         position_s = 0.0
-        if wait(lap_s - time.monotonic()):
+        if wait(lap_start_s - time.monotonic()):
             return
 
 
@@ -184,47 +195,47 @@ def _open_stream(camera: LiveCamera) -> "InputContainer":
         raise OSError(_describe(error)) from None
     if not container.streams.video:
         container.close()
-        raise OSError("expected a video, got none there")
+        raise OSError("expected a video stream, got none")
     return container
 
 
 def _describe(error: Exception) -> str:
-    """FFmpeg's message, without numbers and addresses, which may hold a password."""
+    """FFmpeg's message, without its error number and the address, which may contain a password."""
     import av
 
-    if isinstance(error, av.ExitError):
+    if isinstance(error, av.ExitError):  # the time limit has passed
         return "it is silent"
     return getattr(error, "strerror", None) or str(error).partition(":")[0]
 
 
 class DamageFilter:
-    """Rejects damaged images, and those that depend on damaged ones."""
+    """Rejects damaged images, and later ones that may have been predicted from them."""
 
     def __init__(self, counts: "Counter[str]") -> None:
         self._counts = counts
         self._has_begun = False
-        """Whether there was an undamaged image."""
+        """Whether an image was accepted."""
         self._damaged_s: float | None = None
-        """When the last damaged image arrived; None after an undamaged one."""
+        """When the last damaged image arrived; None after an image was accepted."""
 
-    def note(self, now_s: float) -> None:
-        """Note a damaged image."""
-        self._count()
+    def note_damaged(self, now_s: float) -> None:
+        """Note that a damaged image has arrived."""
+        self._count_rejected()
         self._damaged_s = now_s
 
     def accepts(self, frame: "VideoFrame", is_damaged: bool, now_s: float) -> bool:
-        """Whether this image can be used."""
+        """Whether this image can be used; `is_damaged` is whether its packet is."""
         if frame.is_corrupt or is_damaged:
-            self.note(now_s)
+            self.note_damaged(now_s)
             return False
         if self._damaged_s is not None and not frame.key_frame and now_s < self._damaged_s + DAMAGED_S:
-            self._count()
+            self._count_rejected()
             return False
         self._has_begun = True
         self._damaged_s = None
         return True
 
-    def _count(self) -> None:
-        """Count a rejected image, except at the start: a stream that is joined in the middle begins with some."""
+    def _count_rejected(self) -> None:
+        """Count a rejected image, unless none was accepted yet: a stream joined in the middle may begin with some."""
         if self._has_begun:
             self._counts["torn"] += 1

@@ -13,30 +13,34 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 MAX_DRIVER_DELAY_S = 1.0
-"""A driver's timestamp is on a clock of this machine if it lies at most this many seconds before
-the arrival."""
+"""A driver's timestamp is on a clock of this machine if that clock puts it at most this many seconds
+before the image's arrival."""
 LAG_PACKETS = {"rtsp": 1, "rtp": 1, "mpegts": 2}
-"""FFmpeg delays images by these numbers of packets: its parsers detect an image's end by the next
-one's start."""
+"""FFmpeg returns a packet of these formats this many packets late: its parsers find the end of an
+image only at the start of the next one."""
 UNTIMED_FORMATS = WITHOUT_TIMES | {"mpjpeg", "rawvideo", "image2pipe", "jpeg_pipe"}
 """These formats of FFmpeg have no meaningful timestamps."""
 
 
 class ArrivalTimes:
-    """Images are taken when their packets arrive."""
+    """Arrival times: each image counts as taken when its packet arrives."""
 
     def __init__(self) -> None:
         self._last_pts: int | None = None
+        """The timestamp of the last image."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
-        """Note that a packet has arrived; `waited` is whether the reader waited for it."""
+        """Note that the reader has received a packet; `waited` is whether it had to wait for it.
+
+        A packet that was not waited for may have been in a queue, so its arrival time means little.
+        """
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """When an image was taken; None if unknown."""
+        """When an image was taken, on this machine's monotonic clock; None if unknown."""
         return arrived_s
 
     def is_new(self, frame: "VideoFrame", counts: "Counter[str]") -> bool:
-        """Whether the image has another timestamp than the last one."""
+        """Whether the image's timestamp differs from the previous image's; counts it as "duplicated" if not."""
         is_repeated = frame.pts is not None and frame.pts == self._last_pts
         self._last_pts = frame.pts
         counts["duplicated"] += is_repeated
@@ -44,19 +48,21 @@ class ArrivalTimes:
 
 
 class SenderTimes(ArrivalTimes):
-    """The sender's timestamps, on this machine's clock."""
+    """The sender's timestamps, converted to this machine's clock."""
 
     def __init__(self, lag_packets: int = 0) -> None:
+        """Set up; `lag_packets` is how many packets late FFmpeg returns each packet."""
         super().__init__()
         self._clock = SenderClock()
+        self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last packets; None for one that was in a queue. FFmpeg lags
-        `lag_packets` behind, so the newest packet's data arrived at the first of these times."""
+        """When the reader received the last packets; None for those that were not waited for. The data
+        of the last one had already arrived at the first of these times, because of FFmpeg's lag."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ArrivalTimes.add_packet`."""
         self._arrivals_s.append(arrived_s if waited else None)
-        if len(self._arrivals_s) < (self._arrivals_s.maxlen or 0):
+        if len(self._arrivals_s) <= self._lag_packets:
             return
         data_arrived_s = self._arrivals_s[0]
         if data_arrived_s is not None and packet.dts is not None and packet.time_base is not None:
@@ -71,17 +77,18 @@ class DriverTimes(SenderTimes):
     """The kernel's timestamps, which are on one of this machine's clocks if the driver is correct."""
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """See `ArrivalTimes.taken_s`."""
-        monotonic_offset_s = 0.0
-        wall_offset_s = time.time() - time.monotonic()
-        for offset_s in (monotonic_offset_s, wall_offset_s):
-            if frame.time is not None and 0 <= arrived_s - (frame.time - offset_s) < MAX_DRIVER_DELAY_S:
-                return frame.time - offset_s
+        """See `ArrivalTimes.taken_s`; times on an unknown clock are converted like a sender's."""
+        if frame.time is not None:
+            from_monotonic_s = frame.time
+            from_wall_clock_s = frame.time - (time.time() - time.monotonic())
+            for taken_s in (from_monotonic_s, from_wall_clock_s):
+                if 0 <= arrived_s - taken_s < MAX_DRIVER_DELAY_S:
+                    return taken_s
         return super().taken_s(frame, arrived_s)
 
 
 def frame_times(camera: LiveCamera, container: "InputContainer") -> ArrivalTimes:
-    """The times of a camera's images, by its setting `clock` and the stream's format."""
+    """Choose how to time a camera's images, by its setting `clock` and the stream's format."""
     formats = container.format.name.split(",")
     if camera.clock == "arrival" or (camera.clock == "auto" and set(formats) & UNTIMED_FORMATS):
         return ArrivalTimes()

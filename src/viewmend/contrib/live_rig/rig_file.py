@@ -18,9 +18,9 @@ from viewmend.utils.untrusted_input import one_of, typed
 MAX_BYTES = 1_000_000
 """A rig's file is read up to this many bytes."""
 SCHEMES = ("rtsp", "rtsps", "rtp", "http", "https", "udp", "tcp", "srt")
-"""Schemes of addresses; anything else is a file or a device."""
+"""Schemes of cameras' addresses; what has no scheme is a file or a device."""
 DEVICE = re.compile(r"/dev/video\d+|/dev/v4l/.+")
-"""A file of this name is a V4L2 device."""
+"""Paths of V4L2 devices."""
 Text = Annotated[str, Meta(min_length=1, max_length=4000)]
 Milliseconds = Annotated[float, Meta(ge=1, le=10_000)]
 
@@ -33,7 +33,7 @@ class MaskEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     plates: Text = "plates/{camera}.png"
     """Method plate: path of each camera's clean plate."""
     scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
-    """Scale at which masks are computed; 0.5 costs a quarter."""
+    """Scale at which masks are computed; 0.5 takes a quarter of the time."""
 
     def __post_init__(self) -> None:
         if "{camera}" not in self.plates:
@@ -41,7 +41,7 @@ class MaskEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RigCameraEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One of the file's cameras."""
+    """A table `[[cameras]]` of the file; `docs/guide/live-rig.md` describes the keys."""
 
     name: Text
     url: Text
@@ -60,7 +60,7 @@ class RigCameraEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All of the file."""
+    """The content of the file; `docs/guide/live-rig.md` describes the keys."""
 
     calibration: Text
     format: Text | None = None
@@ -80,23 +80,24 @@ class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """One camera: its address, calibration and masks."""
+    """One camera: its address, its calibration, and how its masks are made."""
 
     calibration: NativeCamera
-    """The calibration of the (reduced) images, before undistortion."""
-    taken_px: tuple[int, int]
-    """Width and height of the camera's own images."""
+    """The calibration for images at the size at which they are used, with the lens distortion."""
+    sent_px: tuple[int, int]
+    """Width and height of the images that the camera sends; they may be reduced before use."""
     url: str
     format: str | None
     """FFmpeg's input format; None if the url determines it."""
     options: tuple[tuple[str, str], ...]
     """FFmpeg's options for this input."""
     clock: str
+    """Where the times of images come from: auto, sender or arrival."""
     offset_s: float
-    """Subtracted from the times of its images."""
+    """The camera's delay, which is subtracted from the times of its images."""
     mask: MaskEntry
     plate: Path
-    """The clean plate, for the method `plate`."""
+    """The clean plate, for the mask method `plate`."""
 
     @property
     def name(self) -> str:
@@ -111,21 +112,23 @@ class LiveCamera:
 
 @dataclass(frozen=True)
 class LiveRig:
-    """All of a `rig.toml`, with its calibration."""
+    """The content of a `rig.toml`, with the calibration that it names."""
 
     name: str
     cameras: tuple[LiveCamera, ...]
     fps: float
     tolerance_s: float
-    """Largest distance of an image from its frame's time."""
+    """Largest difference between the times of an image and its frame."""
     wait_s: float
     """How long a frame waits for late images."""
     up: Float64[np.ndarray, "3"] | None
+    """The up axis of the world; None if the calibration has none."""
     bounds_m: Float64[np.ndarray, "2 3"] | None
+    """Lowest and highest corner of the subject's volume; None if the calibration has none."""
 
 
 def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
-    """Read a `rig.toml` and its calibration; images are reduced to `max_image_size` on their longer side.
+    """Read a `rig.toml` and its calibration; images are to be reduced to `max_image_size` on their longer side.
 
     Raises:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
@@ -163,21 +166,22 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     )
 
 
-def _calibration(place: Path, format: str | None) -> NativeCalibration:
-    """The calibration of a folder of any format, or of a file in one.
+def _calibration(path: Path, format: str | None) -> NativeCalibration:
+    """The calibration in a folder of any format, or in a file of such a folder.
 
     Raises:
-        CaptureError: there is none, or the readers would use another file of the folder than `place`.
+        CaptureError: there is none, or the calibration that was recognised is not in this file.
     """
-    if not place.is_file():
-        return read_any_calibration(place, format)
-    found = read_any_calibration(place.parent, format)
-    uses_other_file = found.file.resolve() != place.resolve() and found.file.suffix == place.suffix
-    if uses_other_file and format is None:
+    if not path.is_file():
+        return read_any_calibration(path, format)
+    calibration = read_any_calibration(path.parent, format)
+    # Another file with the same suffix is taken for another calibration; with another suffix, for a part of this one.
+    is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
+    if is_other and format is None:
         raise CaptureError(
-            f"{place}: expected the folder's calibration, which is {found.file.name}; name the format"
+            f"{path}: expected the folder's calibration, which is {calibration.file.name}; name the format"
         )
-    return found
+    return calibration
 
 
 def _camera(
@@ -187,13 +191,15 @@ def _camera(
     folder: Path,
     max_image_size: int | None,
 ) -> LiveCamera:
-    on_disk = "://" not in entry.url
-    device = on_disk and DEVICE.fullmatch(entry.url)
+    format = entry.format
+    if format is None and DEVICE.fullmatch(entry.url):
+        format = "v4l2"
+    is_file = format is None and "://" not in entry.url
     return LiveCamera(
         calibration=_reduced(calibration, max_image_size),
-        taken_px=(calibration.width, calibration.height),
-        url=str(folder / entry.url) if on_disk and not device and entry.format is None else entry.url,
-        format="v4l2" if device and entry.format is None else entry.format,
+        sent_px=(calibration.width, calibration.height),
+        url=str(folder / entry.url) if is_file else entry.url,
+        format=format,
         options=tuple(entry.options.items()),
         clock=entry.clock,
         offset_s=entry.offset_ms / 1000,
@@ -203,7 +209,7 @@ def _camera(
 
 
 def _reduced(camera: NativeCamera, max_image_size: int | None) -> NativeCamera:
-    """The camera of images reduced to at most this length; distortion does not change."""
+    """The calibration for images reduced to at most this length; distortion coefficients do not change."""
     longest = max(camera.width, camera.height)
     if max_image_size is None or longest <= max_image_size:
         return camera

@@ -1,4 +1,4 @@
-"""The frame source of `viewmend serve rig.toml`: cameras that this machine reads itself."""
+"""The frame source of `viewmend serve rig.toml`: cameras whose images this process reads itself."""
 
 import logging
 import threading
@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from viewmend.contrib.live_rig.aligner import Aligner, ImageGroup, TimedImages
-from viewmend.contrib.live_rig.frame_readers import Picture, Playback, read_pictures
+from viewmend.contrib.live_rig.frame_readers import DecodedImage, Playback, read_images
 from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
 from viewmend.contrib.live_rig.worker import CameraWorker
 from viewmend.data.camera_images import CameraImages, stack_images
@@ -29,9 +29,9 @@ WATCH_S = 1.0
 REPORT_S = 30.0
 """Losses are reported at this interval, in seconds."""
 FIRST_FRAME_S = 3.0
-"""The first frame, which sets alignment and axes, waits this many seconds for all cameras."""
+"""A rig's first frame waits this many seconds for all cameras: alignment and axes are found in it."""
 REPORTED_EVENTS = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
-"""The events of a camera that are reported as losses."""
+"""Events that are reported as losses; docs/guide/live-rig.md describes them."""
 
 log = logging.getLogger("viewmend.live")
 
@@ -87,14 +87,15 @@ class RigFileSource(LiveSource):
         """A placeholder without cameras, until `_switch_to` replaces it."""
         self._workers: dict[str, CameraWorker] = {}
         self._new_workers: list[CameraWorker] = []
-        """Workers that `_begin_rig` starts."""
-        self._first_frame_until_s: float | None = None
+        """Workers that `_begin_rig` is going to start."""
+        self._first_frame_deadline_s: float | None = None
+        """When the first frame is added even without all cameras; None until it has images of two."""
         self._stopped = False
         self._stamp = FileStamp.of(path)
         self._reported: dict[str, dict[str, int]] = {}
-        """The cameras' counts at the last report."""
+        """The cameras' event counts at the last report."""
         self._prepared: PreparedCapture | None = None
-        """Alignment and colours of this rig; None before its first frame."""
+        """The rig with its alignment and colour matching; None before its first frame."""
         self._switch_to(read_rig(path, max_image_size))
         self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
 
@@ -104,7 +105,7 @@ class RigFileSource(LiveSource):
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and close the cameras."""
+        """Stop reading, and close the cameras."""
         self._stopped = True
         with self._cameras_lock:
             self._cameras_lock.notify_all()
@@ -116,7 +117,7 @@ class RigFileSource(LiveSource):
             worker.stop()
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
-        """Event counts of each camera, and whether it is connected."""
+        """Event counts of each camera, and as "up", whether it delivers images."""
         with self._cameras_lock:
             return {
                 name: {"up": int(worker.up), **worker.counts, **self._aligner.counts[name]}
@@ -124,10 +125,10 @@ class RigFileSource(LiveSource):
             }
 
     def _switch_to(self, rig: LiveRig) -> None:
-        """Switch to this rig. Unchanged cameras continue; new ones are opened by `_begin_rig`.
+        """Replace the current rig. Unchanged cameras continue; new ones are opened by `_begin_rig`.
 
         Raises:
-            CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
+            CaptureError: a clean plate or a recording cannot be used. The current rig stays as it is.
         """
         # Workers of unchanged cameras are kept. Cameras hold arrays, which == does not compare as a
         # whole, so their representations are compared.
@@ -136,15 +137,15 @@ class RigFileSource(LiveSource):
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}
         gone = [worker for name, worker in self._workers.items() if name not in kept]
 
-        # Recordings are played on one time line.
+        # Recordings are played on one timeline.
         recordings = [camera for camera in rig.cameras if camera.is_file]
         if recordings:
-            found = self._playback.follow(
-                [video_track(camera.name, "images", Path(camera.url)) for camera in recordings]
-            )
-            if found is not None:
-                log.warning("%s", found)
+            tracks = [video_track(camera.name, "images", Path(camera.url)) for camera in recordings]
+            timecode_note = self._playback.synchronise(tracks)
+            if timecode_note is not None:
+                log.warning("%s", timecode_note)
 
+        # The new rig takes over, with the event counts of unchanged cameras. `--fps` overrides the file's rate.
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
         with self._cameras_lock:
@@ -155,28 +156,27 @@ class RigFileSource(LiveSource):
             workers = kept | new
             self._workers = {name: workers[name] for name in names}
         self._cameras = pinhole_cameras([camera.calibration for camera in rig.cameras])
-        self._first_frame_until_s = None
+        self._first_frame_deadline_s = None
         self._new_workers = list(new.values())
         for worker in gone:
             worker.ask_to_stop()
 
     def _make_worker(self, camera: LiveCamera) -> CameraWorker:
-        def connect(worker: CameraWorker) -> Generator[Picture, None, None]:
-            return read_pictures(camera, worker.counts, self._playback, worker.wait)
+        def connect(worker: CameraWorker) -> Generator[DecodedImage, None, None]:
+            return read_images(camera, worker.counts, self._playback, worker.wait)
 
         def wants(taken_s: float, period_s: float) -> bool:
             return self._aligner.wants(taken_s, period_s)
 
-        return CameraWorker(camera, connect, self._deliver, wants)
+        return CameraWorker(camera, connect, self._add_image, wants)
 
     def _begin_rig(self) -> None:
         """Announce the rig to viewers, and open its new cameras."""
         rig = self._rig
-        bounds = (
-            None
-            if rig.bounds_m is None
-            else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
-        )
+        bounds = None
+        if rig.bounds_m is not None:
+            low, high = torch.tensor(rig.bounds_m, dtype=torch.float32)
+            bounds = Bounds(low, high)
         up = None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32)
         self.begin(rig.name, rig.fps, bounds, up)
         for worker in self._new_workers:
@@ -191,8 +191,8 @@ class RigFileSource(LiveSource):
                     self._cameras_lock.wait(0.1)
                     groups = self._aligner.take(time.monotonic())
                 for group in groups:
-                    self._show(group)
-            except Exception as error:  # nothing may end the thread
+                    self._add_group(group)
+            except Exception as error:  # the thread goes on, whatever happens to a frame
                 self._set_error(f"{type(error).__name__}: {error}"[:400])
             now_s = time.monotonic()
             if now_s > watched_s + WATCH_S:
@@ -203,17 +203,20 @@ class RigFileSource(LiveSource):
                 reported_s = now_s
                 self._report_losses()
 
-    def _show(self, group: ImageGroup) -> None:
-        """Add one frame, prepared as in `viewmend mend`."""
+    def _add_group(self, group: ImageGroup) -> None:
+        """Add a group's images as a frame, aligned and colour-matched, if it has enough cameras."""
         names = [name for name in self._cameras.names if name in group.by_camera]
         if len(names) < 2:
             return
+
+        # The first frame waits for all cameras.
         if self._prepared is None and len(names) < len(self._cameras):
             now_s = time.monotonic()
-            if self._first_frame_until_s is None:
-                self._first_frame_until_s = now_s + FIRST_FRAME_S
-            if now_s < self._first_frame_until_s:
+            if self._first_frame_deadline_s is None:
+                self._first_frame_deadline_s = now_s + FIRST_FRAME_S
+            if now_s < self._first_frame_deadline_s:
                 return
+
         images = [group.by_camera[name].images for name in names]
         frame = stack_images(images, self._cameras.select(names), 0)
         if self._prepared is None:
@@ -222,13 +225,13 @@ class RigFileSource(LiveSource):
             self.status = replace(self.status, error="the masks are empty: no subject is visible")
             return
         self.spread_ms = 1000 * group.spread_s
-        self.add(self._prepared.adjust(frame, "the newest frame"))
+        self.add(self._prepared.adjust(frame, label="the newest frame"))
 
     def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
-        """Check, align and colour-match the rig by its first frame; None while fewer than two cameras see a subject."""
+        """Check, align and colour-match the rig by its first frame; None if fewer than two masks show a subject."""
         assert frame.mask is not None, "live cameras are masked"
-        seeing = (frame.mask.amax((1, 2)) > FOREGROUND).sum()
-        if int(seeing) < 2:
+        num_subjects = (frame.mask.amax((1, 2)) > FOREGROUND).sum()
+        if int(num_subjects) < 2:
             return None
         assert self.rig is not None, "the rig has begun"
         capture = MemoryCapture(
@@ -244,10 +247,10 @@ class RigFileSource(LiveSource):
             log.warning("%s", change)
         return prepared
 
-    def _deliver(self, name: str, taken_s: float, images: CameraImages) -> None:
-        """Add an image to the aligner; the cameras' workers call this."""
+    def _add_image(self, name: str, taken_s: float, images: CameraImages) -> None:
+        """Add a camera's image and mask to the aligner. Called on the threads of the cameras' workers."""
         with self._cameras_lock:
-            if name in self._aligner.counts:  # else the camera has just left the rig
+            if name in self._aligner.counts:  # otherwise the camera has just been removed from the rig
                 self._aligner.put(name, TimedImages(taken_s, images), time.monotonic())
                 self._cameras_lock.notify()
 
@@ -276,14 +279,14 @@ class RigFileSource(LiveSource):
             self._set_error(f"expected at least two cameras, got {connected}; {first}")
 
     def _set_error(self, error: str) -> None:
-        """Set the status, and log an error that is not the last one."""
+        """Set the status to an error, and log it if it is a new one."""
         if self.status.error != error:
             log.warning("%s", error)
         self.status = replace(self.status, state="failing", error=error)
         self.changed()
 
     def _report_losses(self) -> None:
-        """Log what was lost since the last report, if anything."""
+        """Log each camera's losses since the last report, if there are any."""
         lines: list[str] = []
         counted = self.camera_counts()
         for name, counts in counted.items():

@@ -1,4 +1,4 @@
-"""One worker per camera: it reads images, reconnects after failures, makes masks, and delivers the result."""
+"""Workers, one per camera, that read images, reconnect after failures, make masks and deliver the results."""
 
 import contextlib
 import logging
@@ -10,7 +10,7 @@ from queue import Empty, Queue
 
 import numpy as np
 
-from viewmend.contrib.live_rig.frame_readers import Picture
+from viewmend.contrib.live_rig.frame_readers import DecodedImage
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
@@ -25,15 +25,17 @@ FIRST_PAUSE_S = 0.1
 MAX_PAUSE_S = 1.0
 """The longest pause between attempts to connect, in seconds."""
 POLL_S = 0.2
-"""The masking thread checks at this interval, in seconds, whether it has to end."""
+"""A thread that waits for images checks at this interval, in seconds, whether it has to end."""
 PERIOD_GAIN = 0.05
-"""The estimated interval between images moves by this fraction of its difference from the newest one."""
+"""Weight of the newest interval between two images in the moving average of these intervals."""
+MAX_PERIOD_S = 1.0
+"""Longer intervals between two images, in seconds, are interruptions."""
 
 log = logging.getLogger("viewmend.live")
 
 
 def reduce_image(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
-    """The image resized to this width and height; unchanged if it has them."""
+    """An image reduced to this width and height; unchanged if it already has this size."""
     import cv2
 
     if rgb.shape[1::-1] == size_px:
@@ -43,12 +45,13 @@ def reduce_image(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
 
 def mask_size_px(camera: LiveCamera) -> tuple[int, int]:
     """Width and height at which a camera's masks are made."""
-    size_px = camera.calibration.width, camera.calibration.height
-    return max(1, round(size_px[0] * camera.mask.scale)), max(1, round(size_px[1] * camera.mask.scale))
+    width = max(1, round(camera.calibration.width * camera.mask.scale))
+    height = max(1, round(camera.calibration.height * camera.mask.scale))
+    return width, height
 
 
 def mask_maker(camera: LiveCamera) -> MaskMaker:
-    """The mask maker of a camera, by its rig's settings, for images of `mask_size_px`.
+    """Create a camera's mask maker as its rig's settings say, for images of `mask_size_px`.
 
     Raises:
         CaptureError: its clean plate is missing, unreadable or of another size.
@@ -57,25 +60,32 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
         return PersonMasks()
     where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
     plate = read_plate(camera.plate, where)
-    if plate.shape[1::-1] != camera.taken_px:
-        expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
+    height, width = plate.shape[:2]
+    if (width, height) != camera.sent_px:
+        expected = "{} x {}".format(*camera.sent_px)
         raise CaptureError(
-            f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again"
+            f"{where}: expected {expected} pixels as the calibration says, got {width} x {height}; take it again"
         )
     return PlateMasks(reduce_image(plate, mask_size_px(camera)))
 
 
 class CameraWorker:
-    """Two threads of one camera: one reads and decodes, one makes masks of the newest image."""
+    """Two threads for one camera: one reads and decodes images, the other makes masks of the newest one."""
 
     def __init__(
         self,
         camera: LiveCamera,
-        connect: Callable[["CameraWorker"], Generator[Picture, None, None]],
+        connect: Callable[["CameraWorker"], Generator[DecodedImage, None, None]],
         deliver: Callable[[str, float, CameraImages], None],
         wants: Callable[[float, float], bool],
     ) -> None:
-        """Set up.
+        """Set up; the threads are started by `start`.
+
+        Args:
+            camera: the camera.
+            connect: connects to the camera, and generates its images until it fails.
+            deliver: called with the camera's name, the time at which an image was taken, and the image.
+            wants: returns whether an image is used, by its time and the camera's interval between images.
 
         Raises:
             CaptureError: the camera's clean plate is missing, or of another size.
@@ -85,24 +95,24 @@ class CameraWorker:
         self.up = False
         """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why the camera delivers no images, or what is wrong with them; None if all is well."""
+        """Why the camera delivers no images, or what is wrong with them; None if nothing is."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
         self._connect = connect
         self._deliver = deliver
         self._wants = wants
-        self._since_s = time.monotonic()
-        """When `up` changed last."""
-        self._last_s: float | None = None
+        self._up_changed_s = time.monotonic()
+        """When `up` last changed."""
+        self._last_taken_s: float | None = None
         """When the last image was taken; None before the first."""
         self._period_s = 0.0
-        """The estimated time between two images; 0 before the second."""
-        self._newest: Queue[Picture] = Queue(1)
-        """The newest image, until it is taken."""
+        """Moving average of the time between two images; 0 before the second."""
+        self._newest: Queue[DecodedImage] = Queue(1)
+        """The newest image, until the other thread gets it."""
         self._stopped = threading.Event()
         self._threads = [
-            threading.Thread(target=work, name=f"{camera.name} {work.__name__}", daemon=True)
-            for work in (self.read, self.make_masks)
+            threading.Thread(target=self.read, name=f"{camera.name} read", daemon=True),
+            threading.Thread(target=self.make_masks, name=f"{camera.name} masks", daemon=True),
         ]
 
     def start(self) -> None:
@@ -111,18 +121,18 @@ class CameraWorker:
             thread.start()
 
     def ask_to_stop(self) -> None:
-        """Request the end; `stop` waits for it."""
+        """Let the threads end, without waiting for them."""
         self._stopped.set()
 
     def stop(self) -> None:
-        """End; a silent camera is abandoned after a few seconds."""
+        """End the threads, and wait for them; one that a silent camera blocks is abandoned after 3 s."""
         self._stopped.set()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=3)
 
     def wait(self, seconds: float) -> bool:
-        """Wait; returns whether the worker must end."""
+        """Wait for some seconds, or until the worker has to end; returns whether it has to."""
         return self._stopped.wait(max(0.0, seconds))
 
     def read(self) -> None:
@@ -131,17 +141,17 @@ class CameraWorker:
         while not self._stopped.is_set():
             began_s = time.monotonic()
             try:
-                with contextlib.closing(self._connect(self)) as pictures:
-                    for picture in pictures:
+                with contextlib.closing(self._connect(self)) as decoded_images:
+                    for decoded in decoded_images:
                         if not self.up:
                             pause_s = FIRST_PAUSE_S
                             self._note_connection()
-                        self._offer(picture)
+                        self._receive(decoded)
                         if self._stopped.is_set():
                             return
                 if not self._stopped.is_set():
                     self._note_failure("its images have ended")
-            except Exception as error:  # any failure is reported, and the camera tried again
+            except Exception as error:  # after any failure, the worker connects again
                 self._note_failure(str(error) or type(error).__name__)
             if self.wait(began_s + pause_s - time.monotonic()):
                 return
@@ -149,67 +159,77 @@ class CameraWorker:
 
     def _note_connection(self) -> None:
         now_s = time.monotonic()
-        log.warning("camera '%s' is connected, after %.1f s", self.camera.name, now_s - self._since_s)
+        log.warning("camera '%s' is connected, after %.1f s", self.camera.name, now_s - self._up_changed_s)
         self.up = True
         self.error = None
-        self._since_s = now_s
+        self._up_changed_s = now_s
         self.counts["connects"] += 1
 
     def _note_failure(self, reason: str) -> None:
         if self.up:
-            self._since_s = time.monotonic()
+            self._up_changed_s = time.monotonic()
         self.up = False
         self._report(reason)
 
     def make_masks(self) -> None:
-        """Mask and deliver the newest image, again and again, until stopped."""
+        """Mask and deliver images, always the newest one next, until stopped."""
         while not self._stopped.is_set():
             try:
-                picture = self._newest.get(timeout=POLL_S)
-                images = self._images(picture)
+                decoded = self._newest.get(timeout=POLL_S)
+                images = self._process(decoded)
             except Empty:
                 continue
             except ValueError as error:
                 self.counts["refused"] += 1
                 self._report(str(error))
                 continue
-            self._deliver(self.camera.name, picture.taken_s, images)
+            self._deliver(self.camera.name, decoded.taken_s, images)
 
-    def _images(self, picture: Picture) -> CameraImages:
-        """The reduced and undistorted image, and its mask; ValueError for a size that is not the calibration's."""
+    def _process(self, decoded: DecodedImage) -> CameraImages:
+        """The reduced and undistorted image, and its mask; ValueError if its size is not the calibration's."""
         import cv2
 
-        frame = picture.frame
-        camera = self.camera.calibration
-        size = (frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)
-        if size != self.camera.taken_px:
-            expected = "{} x {}".format(*self.camera.taken_px)
+        frame = decoded.frame
+        stored_px = (frame.width, frame.height)
+        upright_px = stored_px[::-1] if is_turned(frame) else stored_px
+        if upright_px != self.camera.sent_px:
+            expected = "{} x {}".format(*self.camera.sent_px)
+            got = "{} x {}".format(*upright_px)
             raise ValueError(
-                f"expected pictures of {expected} as the calibration says, got {size[0]} x {size[1]}; "
+                f"expected images of {expected} pixels as the calibration says, got {got}; "
                 "set the camera's mode in 'options'"
             )
-        size_px = camera.width, camera.height
-        rgb = picture.to_rgb(size_px)
-        mask = cv2.resize(self._masks.mask(reduce_image(rgb, mask_size_px(self.camera))), size_px)
-        return self._undistortion.apply(CameraImages(rgb, np.asarray(mask, np.uint8), None))
+        size_px = self.camera.calibration.width, self.camera.calibration.height
+        rgb = decoded.to_rgb(size_px)
+        mask = self._masks.mask(reduce_image(rgb, mask_size_px(self.camera)))
+        full_mask = np.asarray(cv2.resize(mask, size_px), np.uint8)
+        return self._undistortion.apply(CameraImages(rgb, full_mask, depth=None))
 
-    def _offer(self, picture: Picture) -> None:
-        """Pass on an image if its time is wanted."""
-        if self._last_s is not None and 0 < picture.taken_s - self._last_s < 1:
-            step_s = picture.taken_s - self._last_s
-            self._period_s += PERIOD_GAIN * (step_s - self._period_s) if self._period_s else step_s
-        self._last_s = picture.taken_s
+    def _receive(self, decoded: DecodedImage) -> None:
+        """Hand a new image to the other thread if it is wanted, in place of one that still waits there."""
+        self._update_period(decoded.taken_s)
         self.counts["read"] += 1
-        if not self._wants(picture.taken_s, self._period_s):
+        if not self._wants(decoded.taken_s, self._period_s):
             self.counts["thinned"] += 1
             return
         with contextlib.suppress(Empty):
-            self._newest.get_nowait()  # drop an image that was not masked yet
+            self._newest.get_nowait()
             self.counts["replaced"] += 1
-        self._newest.put(picture)
+        self._newest.put(decoded)
+
+    def _update_period(self, taken_s: float) -> None:
+        """Update the average time between two images with the time of a new one."""
+        step_s = 0.0 if self._last_taken_s is None else taken_s - self._last_taken_s
+        self._last_taken_s = taken_s
+        if not 0 < step_s < MAX_PERIOD_S:
+            return
+        if self._period_s == 0:
+            self._period_s = step_s
+        else:
+            self._period_s += PERIOD_GAIN * (step_s - self._period_s)
 
     def _report(self, error: str) -> None:
-        """Report an error, once until it changes."""
+        """Set the camera's error, and log it if it is a new one."""
         if error != self.error:
             log.warning("camera '%s': %s", self.camera.name, error)
         self.error = error
