@@ -86,8 +86,8 @@ class RunOptions:
     the model 'views' predicts all around the subject. The latter takes several times as long as a
     view, once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
-    for it, and always the same on a machine."""
+    """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was
+    trained in it and the device computes in it natively, otherwise float32."""
     top_k: int | None = None
     """Number of context tokens that the paper's model keeps when pruning; by default the model's own."""
     shown: int = 12

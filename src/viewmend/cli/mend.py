@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from viewmend.geometry.cameras import Cameras
     from viewmend.mending import Mender
     from viewmend.models.base import Inpainter
+    from viewmend.rendering.view import RenderConfig
     from viewmend.scenes.held_out import Protocol
 
 
 LARGE_PX = 1000
-"""Images whose longer side has more pixels than this take long, which `--scale` avoids."""
+"""For images with a longer side of more pixels than this, a long run is advised to use `--scale`."""
 KEPT_MB = 300.0
-"""Earlier frames are kept up to this much memory, MB, if the model does not need them: an orbit may show them again."""
+"""Memory for earlier frames, in MB, if the model does not need them: an orbit may return to them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,15 +38,18 @@ class Options:
     completed), the true image of a held-out camera (true/*.png), rendered, completed and true views
     side by side (compared.mp4), and contact_sheet.png.
 
-    With --leave-out, that camera's view is rendered without its image and mask, which then score
-    it. PSNR in dB: of the whole image (also as rendered), of the subject (inside the true mask), of
-    the pixels that a camera colours ("valid"), and of the holes ("fg": inside the true mask), the
-    holes also for OpenCV's Telea fill. SSIM: of the whole image. LPIPS (AlexNet): of the whole
-    image and of the subject. IoU: of alpha and the true mask. PSNRs are means over frames; in the
-    holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of the
-    hull's pixels that are holes, completed_fraction the fraction to be completed.
+    With --leave-out, that camera's view is rendered without its image and mask, and then scored
+    against them. PSNR, in dB, is given for the whole image, for the subject (inside the true mask),
+    for pixels that a camera colours ("valid"), for holes, and for holes inside the true mask
+    ("fg"). For comparison, it is also given for the whole image as rendered, and for holes that
+    OpenCV's Telea fills. SSIM is given for the whole image, LPIPS (AlexNet) for the whole image and
+    for the subject. IoU compares alpha with the true mask. All scores are means over frames; those
+    of holes leave out frames with fewer than 50 such pixels, unless all have fewer. hole_fraction
+    is the fraction of the hull's pixels that are holes, completed_fraction the fraction that is
+    completed.
 
-    Images and scores are on a black background, or on white for a model trained on white (paper-small).
+    Images are composited on black for output and scores, or on white if the model was trained on
+    white (paper-small).
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -54,7 +58,7 @@ class Options:
     """Folder for the results; created if missing. Results of an earlier run in it are replaced,
     other files kept."""
     leave_out: str | None = None
-    """Name of a camera to hold out and whose view to render. Give either this or --path."""
+    """Name of a camera to hold out; its view is rendered from the others. Give either this or --path."""
     path: str | None = None
     """'orbit' circles the subject with its whole motion in view; options may follow, as in
     orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON
@@ -66,9 +70,9 @@ class Options:
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] | None = None
-    """What is known of the mask of the --leave-out camera. 'strict': nothing. 'predicted-mask': nothing, but
-    the alpha that 'views' predicts takes its place. 'target-mask': the mask cuts and composites the
-    view, as in the paper. 'hull-with-target-mask': the mask only carves the hull. By default
+    """How the mask of the --leave-out camera is used. 'strict': not at all. 'predicted-mask': not at
+    all, and the alpha that 'views' predicts replaces it. 'target-mask': to cut out and composite
+    the view, as in the paper. 'hull-with-target-mask': only to carve the hull. By default
     'predicted-mask' for the paper's model, 'strict' for others."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
@@ -80,8 +84,8 @@ class Options:
     frames: str | None = None
     """Frames to use, as FIRST:END by index; all by default."""
     scale: float = 1.0
-    """Fraction of their size at which images are used, above 0 and up to 1. Views of a camera and of an orbit get
-    smaller with them. 0.5 takes about a quarter of the time, and less memory."""
+    """Factor by which width and height of the images are reduced, above 0 and up to 1. Views of a
+    camera and of an orbit are reduced, too. 0.5 takes about a quarter of the time, and less memory."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     alpha: bool = False
     """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9
@@ -96,8 +100,8 @@ class Options:
     the model 'views' predicts all around the subject. The latter takes several times as long as a
     view, once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
-    for it, and always the same on a machine."""
+    """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was
+    trained in it and the device computes in it natively, otherwise float32."""
     json: bool = False
     """Write the scores to standard output as one JSON object, and nothing else."""
 
@@ -112,8 +116,8 @@ def run(options: Options) -> int:
     from viewmend.data.source import prefetch
     from viewmend.mending import MendSummary, default_protocol
 
-    # Open and prepare the capture
-    options.view.config()  # raises errors of options before anything is read
+    # Open and prepare the capture. Options are checked before anything is read.
+    render = options.view.config()
     turntable = parse_turntable(options.path or "")
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
@@ -124,13 +128,13 @@ def run(options: Options) -> int:
     capture = _prepare(options, opened, held, usable)
 
     # Render and complete the views
-    mender = _make_mender(options, inpainter, capture.bounds, held, protocol)
+    mender = _make_mender(options, render, inpainter, capture.bounds, held, protocol)
     if turntable is not None and turntable.background:
         mender.background = turntable.background
     summary = MendSummary(protocol)
     plan = _plan(options, capture, times, usable, turntable)
-    plan = [(time, target) for time, target in plan if time in usable]
-    frames = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)])  # no repeated reads
+    plan_times = [time for time, _ in plan]
+    frames = prefetch(capture, [time for time, _ in groupby(plan_times)])  # views in a row share a frame
     frame = None
     fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
@@ -140,7 +144,7 @@ def run(options: Options) -> int:
         for time, target in track(views, "inpainting", total=len(plan)):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
-            truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
+            truth = frame.select(held) if options.leave_out in frame.cameras.names else None
             step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
@@ -148,9 +152,8 @@ def run(options: Options) -> int:
     # Report
     say(f"wrote {options.out}")
     if summary.empty:
-        say(
-            f"{without_subject(capture, summary.empty, len({time for time, _ in plan}))}; they show the background"
-        )
+        empty_frames = without_subject(capture, summary.empty, len(set(plan_times)))
+        say(f"{empty_frames}; they show the background")
     if options.json:
         print_json(summary.as_json())
     else:
@@ -178,7 +181,7 @@ def _check(options: Options) -> None:
 
 
 def _speed_advice(options: Options, cameras: "Cameras") -> str:
-    """Advice that makes a long run shorter; "" for images that are small already."""
+    """Advice that shortens a long run; "" for images that are small already."""
     size_px = max(cameras.max_size_px)
     if options.scale < 1 or size_px <= LARGE_PX:
         return ""
@@ -186,10 +189,17 @@ def _speed_advice(options: Options, cameras: "Cameras") -> str:
 
 
 def _open(options: Options, held: tuple[str, ...]) -> "CaptureFolder":
+    """Open the capture with the input cameras and the held-out one.
+
+    Raises:
+        CaptureError: it cannot be used, or does not have these cameras.
+    """
     from viewmend.data.errors import CaptureError
     from viewmend.data.prepare import open_masked
 
-    names = list(dict.fromkeys([*options.cameras, *held])) if options.cameras else None
+    names = None
+    if options.cameras:
+        names = list(dict.fromkeys([*options.cameras, *held]))  # without duplicates
     capture = open_masked(options.capture, names, held=len(held), format=options.format)
     if not set(held) <= set(capture.cameras.names):
         known = list(capture.cameras.names)
@@ -201,7 +211,7 @@ def _open(options: Options, held: tuple[str, ...]) -> "CaptureFolder":
 def _prepare(
     options: Options, opened: "CaptureFolder", held: tuple[str, ...], usable: list[int]
 ) -> "PreparedCapture":
-    """The capture at the size asked for, aligned and checked by its input cameras."""
+    """The capture at the requested scale, aligned and checked by its input cameras."""
     from viewmend.cli.checks import log_preparation
     from viewmend.data.prepare import prepare
     from viewmend.data.source import CaptureSubset
@@ -217,18 +227,18 @@ def _prepare(
 
 def _make_mender(
     options: Options,
+    render: "RenderConfig",
     inpainter: "Inpainter",
     bounds: "Bounds | None",
     held: tuple[str, ...],
     protocol: "Protocol",
 ) -> "Mender":
-    """The pipeline with all models that the options need."""
+    """Create the pipeline, with a model that predicts errors if the options need one."""
     from viewmend.mending import Mender
     from viewmend.models.base import RenderQuality
     from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig
 
-    render = options.view.config()
     error_model = None
     if render.error_rule == "predicted" or options.geometry == "fused" or protocol == "predicted-mask":
         error_model = error_model_for(inpainter, options.device, options.precision)
@@ -239,10 +249,10 @@ def _make_mender(
 
 
 def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
-    """The times at which two input cameras or more are present; says which are not.
+    """The frames with images of two or more input cameras; reports the others, which are left out.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no such frame.
     """
     from viewmend.cli.console import say
 
@@ -262,42 +272,51 @@ def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> li
 def _plan(
     options: Options, capture: "CaptureSource", times: range, usable: list[int], turntable: "Turntable | None"
 ) -> "list[tuple[int, Cameras]]":
-    """Frame indices and the camera of each view, in order."""
+    """The frame and the camera of each view, in order; without views of frames that are not usable."""
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
     from viewmend.data.capture_folder import origin_of
 
     if options.leave_out is not None:
-        return [(time, capture.cameras.select([options.leave_out])) for time in times]
+        return [(time, capture.cameras.select([options.leave_out])) for time in usable]
     if turntable is not None:
         return _circle(turntable, capture, usable)
-    return pair_with_frames(
-        read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture)), times
-    )
+    path = read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture))
+    return [(time, pose) for time, pose in pair_with_frames(path, times) if time in usable]
 
 
 def _circle(
     turntable: "Turntable", capture: "CaptureSource", usable: list[int]
 ) -> "list[tuple[int, Cameras]]":
-    """Frame indices and the camera of each view of a turntable, whose images show the whole motion."""
+    """The frame and the camera of each view of a turntable; every image is wide enough to show the whole motion."""
     import math
 
     import torch
 
     from viewmend.geometry.orbit import coarse_surface, fit_to, orbit_around, thinned
 
-    shown = turntable.times(usable, capture.fps)
+    # Find what the subject covers in the frames that are shown, or a sample of them.
+    times = turntable.times(usable, capture.fps)
     points = []
-    for frame in map(capture.read, thinned(sorted(set(shown)))):
+    for time in thinned(sorted(set(times))):
+        frame = capture.read(time)
         assert frame.mask is not None, "captures without masks are refused"
         points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
     extent = torch.cat(points)
-    views = len(shown)
     if not len(extent):
         raise ValueError(
             f"{capture.name}: expected a subject to circle, got none in these frames; choose other --frames"
         )
+
+    # One turn around its middle
     center = (extent.amin(0) + extent.amax(0)) / 2
-    arc_rad = None if turntable.arc is None else math.radians(turntable.arc)
-    path = orbit_around(center, capture.cameras, capture.up, views, views, arc_rad, turntable.size_px)
-    path = fit_to(path, extent)
-    return [(time, path[view]) for view, time in enumerate(shown)]
+    orbit = orbit_around(
+        center,
+        capture.cameras,
+        capture.up,
+        views=len(times),
+        frames_per_turn=len(times),
+        arc_rad=None if turntable.arc is None else math.radians(turntable.arc),
+        size_px=turntable.size_px,
+    )
+    path = fit_to(orbit, extent)
+    return [(time, path[view]) for view, time in enumerate(times)]

@@ -62,8 +62,8 @@ class Options:
     model 'views' predicts all around the subject. The latter takes several times as long as a view,
     once per frame."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for
-    it, and always the same on a machine."""
+    """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was
+    trained in it and the device computes in it natively, otherwise float32."""
 
 
 def run(options: Options) -> int:

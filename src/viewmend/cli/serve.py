@@ -93,8 +93,8 @@ class Options:
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     precision: Precision = "auto"
-    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made
-    for it, and always the same on a machine."""
+    """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was
+    trained in it and the device computes in it natively, otherwise float32."""
     memory_mb: float = 3000.0
     """Memory for frames and what is computed from them; with --ray, half of it is the processes'
     shared memory."""
