@@ -1,16 +1,16 @@
-"""What a page needs to draw the views of a frame by itself, made once per frame for all viewers.
+"""Assets: what a page needs to draw the views of a frame by itself, made once per frame for all viewers.
 
-The shape: vertices, faces and vertex colours of the geometry proxy, with the cameras and the
-blending rule. Positions are 16 bits a coordinate within the proxy's box: a thousandth of a pixel
-for a subject that fills a view of any size allowed, at half the bytes of floats. All arrays are
-stored as differences and deflated: browsers inflate by themselves, so the page needs no decoder,
-and a mesh codec would save less than a tenth of a frame's bytes, most of which are images.
+The shape contains the vertices, faces and vertex colours of the geometry proxy, the cameras, and the
+blending rule. Coordinates have 16 bits within the proxy's box, half the bytes of floats; where the
+subject fills a view of the largest size, a step is a thousandth of a pixel. Arrays are stored as
+differences and deflated. Browsers can inflate them without a decoder in the page. A mesh codec would
+save less than a tenth of a frame's bytes, because most of them are images.
 
-The images: the part of each camera's image that shows the subject, as JPEG with colour at full
-resolution, followed by its mask, deflated. Views that a model completed at other poses may be added
-as further cameras; their masks are alpha. WebP halves the colour's resolution, and takes 15 times
-as long, which rules out live rigs. On 20 cameras of wd2, with masks: JPEG 0.72 MB, 36.6 dB and 30
-ms; WebP of quality 90 0.49 MB, 35.4 dB and 385 ms.
+The images are the parts of the cameras' images that show the subject: JPEG with colour at full
+resolution, followed by the deflated mask. Views that a model completed at other poses may be added
+as further cameras, with alpha as masks. WebP would halve the resolution of colour and take more than
+ten times as long, too long for live rigs. For 20 cameras of wd2, with masks, JPEG needs 0.72 MB and
+30 ms for 36.6 dB; WebP of quality 90 needs 0.49 MB and 385 ms for 35.4 dB.
 """
 
 import asyncio
@@ -155,7 +155,7 @@ class AssetStore:
     async def get(self, index: int, version: str, without: Names = ()) -> FrameAssets:
         """The assets of a frame without some cameras; simultaneous requests for the same frame share one result.
 
-        Those of another version, that is, of another rig, are dropped.
+        A new version means a new rig: all assets of the earlier one are dropped.
 
         Raises:
             BusyError: too many other frames are being prepared.
@@ -164,7 +164,7 @@ class AssetStore:
         """
         if version != self._version:
             self._kept.clear()
-            self._making.clear()  # those of the rig before end without being kept
+            self._making.clear()  # tasks of the earlier rig end, and their results are not kept
             self._version = version
             self.size_bytes = 0
         key = index, without

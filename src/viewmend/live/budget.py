@@ -1,4 +1,4 @@
-"""Frame time: the quality of a viewer's next view, and the resolution that all viewers together have time for.
+"""Frame time: chooses the quality of a viewer's next view, and limits resolution so that all viewers are served soon.
 
 docs/live.md describes the ladders of quality levels. The control law of `Budget`:
 
@@ -15,7 +15,7 @@ docs/live.md describes the ladders of quality levels. The control law of `Budget
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf, sqrt
+from math import sqrt
 from statistics import median
 
 from viewmend.live.protocol import FrameTimes
@@ -33,11 +33,11 @@ MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 """A step up that is undone within this many frames was wrong."""
 MAX_WAIT_S = 2.5
-"""All viewers that wait for an image are predicted to be served within this time, one after the other."""
+"""The resolution is limited so that all waiting viewers get an image within this many seconds, one after the other."""
 IDLE_WAIT_S = 1.0
-"""Time limit for an image when other viewers are connected but idle."""
+"""Time limit for an image, in seconds, when other viewers are connected but idle."""
 MIN_MEASURED_PX = 20_000
-"""Smaller images are not measured: most of their time does not depend on resolution."""
+"""Images with fewer pixels are not measured: most of their time does not depend on resolution."""
 DEFAULT_S_PER_PX = 6e-6
 """Seconds per pixel at full quality before any measurement, as on a slow machine."""
 SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
@@ -82,15 +82,22 @@ class Budget:
             raise ValueError(
                 f"expected a positive budget and levels, got {target_ms} ms and {len(levels)} levels"
             )
-        self.budget_ms = self.target_ms = target_ms
-        """The time of a view if there are no other viewers; the target is lower if there are."""
+        self.budget_ms = target_ms
+        """Time that a view may take if there are no other viewers."""
+        self.target_ms = target_ms
+        """Time that the next view may take."""
         self.levels = tuple(levels)
         self.index = len(levels) // 2
         self.measured_ms = 0.0
-        # Stage times, scaled to the full level where they depend on the level.
-        self._geometry, self._pixels, self._inpainting, self._context = (
-            deque[float](maxlen=MEMORY_FRAMES) for _ in range(4)
-        )
+        """Time of the last frame."""
+
+        # Times of the last frames, in ms, scaled to the full level where they depend on the level.
+        # Context is relative to inpainting.
+        self._geometry = deque[float](maxlen=MEMORY_FRAMES)
+        self._pixels = deque[float](maxlen=MEMORY_FRAMES)
+        self._inpainting = deque[float](maxlen=MEMORY_FRAMES)
+        self._context = deque[float](maxlen=MEMORY_FRAMES)
+
         self._up_after = UP_AFTER_FRAMES
         self._frames_with_room = 0
         self._frames_since_up = PROBATION_FRAMES
@@ -125,10 +132,10 @@ class Budget:
         if self.predict_ms(self.level) > self.target_ms and self.index > 0:
             if self._frames_since_up < PROBATION_FRAMES:
                 self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
-            good = [
+            fitting = [
                 n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms
             ]
-            self.index = max(good, default=0)
+            self.index = max(fitting, default=0)
             self._frames_with_room = 0
             self._frames_since_up = PROBATION_FRAMES
         elif self.index + 1 < len(self.levels):
@@ -159,7 +166,7 @@ class ResolutionLimit:
 
     def __init__(self) -> None:
         self._seconds_per_px: deque[float] = deque(maxlen=16)
-        """Seconds per pixel of the last large images; the slowest counts."""
+        """Seconds per pixel of the last large images, at the full level; the slowest one counts."""
 
     def record(self, pixels: float | int, level: QualityLevel, seconds: float) -> None:
         """Add the time of an image of this many pixels at this level."""
@@ -169,14 +176,25 @@ class ResolutionLimit:
     def apply(
         self, level: QualityLevel, pixels: float | int, num_waiting: int, has_other_viewers: bool = False
     ) -> QualityLevel:
-        """The level, with a lower resolution if images of this many pixels for all waiting viewers would take too long.
+        """Lower the resolution of a level if its image is predicted to keep other viewers waiting too long.
 
-        `num_waiting` includes this viewer; `has_other_viewers` is whether others are connected, waiting or not.
+        Args:
+            level: the level that was chosen for the view.
+            pixels: number of pixels of the image at scale 1.
+            num_waiting: number of viewers that wait for an image, including this one.
+            has_other_viewers: whether others are connected, waiting or not.
         """
+        if num_waiting > 1:
+            limit_s = MAX_WAIT_S / num_waiting
+        elif has_other_viewers:
+            limit_s = IDLE_WAIT_S
+        else:
+            return level
         seconds_per_px = max(self._seconds_per_px, default=DEFAULT_S_PER_PX) * _cost_per_px(level)
         image_s = seconds_per_px * pixels * level.scale**2
-        limit_s = MAX_WAIT_S / num_waiting if num_waiting > 1 else IDLE_WAIT_S if has_other_viewers else inf
-        return level if image_s <= limit_s else replace(level, scale=level.scale * sqrt(limit_s / image_s))
+        if image_s <= limit_s:
+            return level
+        return replace(level, scale=level.scale * sqrt(limit_s / image_s))
 
 
 def _cost_per_px(level: QualityLevel) -> float:

@@ -22,7 +22,7 @@ from viewmend.live.protocol import VERSION, pack, token_query, unpack
 from viewmend.types import MultiViewFrame
 
 RATE = 0.9
-"""Part of the server's message rate that a client uses."""
+"""Fraction of the server's limit on messages per second that a client uses."""
 RETRY_S = 0.1
 """Seconds between attempts to reconnect."""
 ANSWER_S = 30.0
@@ -175,7 +175,7 @@ class Client(Connection):
             self.send("on_air", on=True)
 
     def send(self, kind: str, **values: object) -> None:
-        """Send a message of the protocol; waits as long as the server would drop it for coming too soon."""
+        """Send a message of the protocol; waits first if the server would reject one so soon after the others."""
         if self._max_per_s < math.inf:
             now = time.monotonic()
             rate = self._max_per_s
@@ -240,8 +240,8 @@ class Client(Connection):
             if part["kind"] == "image":
                 frame.images[part["eye"], part["mode"]] = from_jpeg(data)
             else:
-                sizes = (part[key] for key in ("width", "height", "stride", "near_m", "far_m"))
-                frame.depth[part["eye"]] = unpack_depth(PackedDepth(data, *sizes))
+                fields = {key: part[key] for key in ("width", "height", "stride", "near_m", "far_m")}
+                frame.depth[part["eye"]] = unpack_depth(PackedDepth(data, **fields))
         return frame
 
 

@@ -22,7 +22,7 @@ class Extension:
         return {}
 
     def running(self) -> contextlib.AbstractAsyncContextManager[None]:
-        """A context that the server holds while it serves."""
+        """A context manager that is entered while the server runs."""
         return contextlib.nullcontext()
 
     def welcome_json(self) -> dict[str, Any]:
@@ -34,7 +34,7 @@ class Extension:
         return {}
 
     def handle(self, session: ViewerSession, message: Message) -> bool:
-        """Use a viewer's message, under the service's lock; False if it is of no use."""
+        """Handle a viewer's message, under the service's lock; returns whether the message is for this extension."""
         return False
 
     def leave(self, session: ViewerSession) -> None:

@@ -20,9 +20,9 @@ from viewmend.types import MultiViewFrame
 from viewmend.utils.tensors import size_bytes, to_mmap
 
 RETRY_S = 1.0
-"""A source that failed is tried again after this long."""
+"""A source that failed is tried again after this many seconds."""
 READ_AHEAD = 3
-"""Frames that are read before they are requested."""
+"""Number of frames after the requested one that are read ahead."""
 
 log = logging.getLogger("viewmend.live")
 
@@ -105,7 +105,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class RigInfo:
-    """What a source knows of its cameras and stage."""
+    """What a source knows about its rig besides the cameras."""
 
     name: str
     bounds: Bounds | None
@@ -138,12 +138,15 @@ class FrameSource(ABC):
         """Time between the first and the last image of the newest frame, if this process
         reads the cameras."""
         self.recording = Clock()
-        """The edge of a recording: one position for all viewers that follow it."""
+        """The clock of a recording's edge, which all viewers that follow it share."""
         self.recording.live = False
 
     @property
     def edge(self) -> float:
-        """The newest frame of a live rig, or the position that all who follow a recording share."""
+        """The playback position of viewers that follow the edge.
+
+        This is the newest frame of a live rig, or the position of a recording's common clock.
+        """
         return float(self.span.newest) if self.span.live else self.recording.position
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
@@ -152,7 +155,7 @@ class FrameSource(ABC):
 
     @abstractmethod
     def read(self, index: int) -> MultiViewFrame | None:
-        """The frame, or None while it is not in memory. Does not wait; a request starts the reading."""
+        """The frame, or None while it is not in memory. Returns at once; the frame is read in the background."""
 
     def read_cached(self, index: int) -> CachedFrame | None:
         """The frame with the geometry and encodings that another process has computed; None if there are none."""

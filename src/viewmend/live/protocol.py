@@ -130,12 +130,12 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
     moving: bool = False
     full: bool = False
-    """Only the view at full quality is of use: the client draws a draft by itself."""
+    """Whether to send only the view at full quality, because the client draws a draft by itself."""
     adaptive: bool = True
     depth: bool = False
     codec: Annotated[str, one_of(*CODECS)] = "jpeg"
     key: bool = False
-    """Start video streams again with a key frame, because the decoder has lost them."""
+    """Whether video streams start again with a key frame, because the client cannot decode them any more."""
     quality: Quality = 85
     background: Colour | None = None
     """Background colour; None for the model's own."""

@@ -30,7 +30,7 @@ from viewmend.utils.untrusted_input import one_of
 
 MAX_POSES = 900
 TURNTABLE_VIEWS = 25
-"""Views of a turntable in which the subject has to fit."""
+"""Number of views around the subject in which it has to fit."""
 SOURCE_QUALITY = 90
 """JPEG quality of the cameras' own images."""
 Result = TypeVar("Result")
@@ -61,7 +61,7 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
     quality: protocol.Quality = 85
     time: Literal["live"] | protocol.Count = "live"
     camera: protocol.ShortText | None = None
-    """A camera of the rig, whose pose, lens and size the view has, and whose image it is scored by."""
+    """A camera of the rig: the view has its pose, lens and size, and is scored against its image."""
     mode: Annotated[str, one_of(*protocol.MODES, "error")] = "completed"
     without: NameList = ""
     token: str = ""
@@ -88,13 +88,14 @@ class SourceImageQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class TurntableQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The query of `GET /turntable`: a film around the subject."""
+    """The query of `GET /turntable`: how to frame a video around the subject so that its motion stays in view."""
 
     time: protocol.Count
-    """Its first frame's index."""
+    """Index of the video's first frame."""
     frames: Annotated[int, Meta(ge=1, le=MAX_POSES)] = 1
+    """Number of frames that the video shows."""
     azimuth: protocol.Degrees = 0.0
-    """The middle of the arc."""
+    """The middle of the arc, in degrees."""
     arc: Annotated[float, Meta(ge=1, le=360)] = 360.0
     elevation: protocol.Elevation = 0.0
     width: protocol.Side = 320
@@ -102,14 +103,14 @@ class TurntableQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     token: str = ""
 
     def moments(self, span: Span) -> list[int]:
-        """The frames that show what the motion covers."""
+        """A sample of the video's frames, from which `frame_motion` learns what the motion covers."""
         count = span.end - span.first
         shown = {span.first + (self.time - span.first + n) % count for n in range(min(self.frames, count))}
         return thinned(sorted(shown))
 
 
 def frame_motion(asked: TurntableQuery, points: Float[Tensor, "point 3"], home: HomeView) -> dict[str, Any]:
-    """Target and distance (metres) and focal length (pixels) with which all images of a turntable show all points."""
+    """Choose target, distance (metres) and focal length (pixels) so that all images of a turntable show all points."""
     center = (points.amin(0) + points.amax(0)) / 2
     azimuths = torch.deg2rad(asked.azimuth + asked.arc * torch.linspace(-0.5, 0.5, TURNTABLE_VIEWS)).tolist()
     elevation_rad = math.radians(asked.elevation)
@@ -223,7 +224,7 @@ class PathJob(RenderJob[bytes]):
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Number of rendered views, and of all views."""
+        """Number of views that were rendered, and of all views."""
         return self._count, len(self._path.poses)
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
@@ -254,7 +255,7 @@ def request_view(
     playback: PlaybackState,
     stereo_m: float | None = None,
 ) -> RenderRequest | None:
-    """The view of the nearest frame; None while that is being read."""
+    """The request for a view of the frame closest to `index`; None while that frame is being read."""
     index = int(playback.span.clamp(index))
     if playback.span.end <= playback.span.first or not playback.has_frame(index):
         return None

@@ -37,9 +37,9 @@ from viewmend.utils.timing import StageTimes, exact_times
 WARM_UP_PX = 64
 """Height and width of the view that is rendered before the first request."""
 MAX_VARIANTS = 3
-"""Number of streams of other models or fewer cameras that are kept."""
+"""Number of streams with another model or fewer cameras that are kept."""
 VARIANT_MB = 200.0
-"""Memory of each of these streams, in MB."""
+"""Memory for the frames of each of these streams, in MB."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,15 @@ class RenderRequest:
     """One per eye."""
     quality: RenderQuality
     error_rule: str | None = None
-    """None for the renderer's own."""
+    """None for the renderer's default rule."""
     extra_modes: frozenset[str] = frozenset()
-    """Additional images, which the renderer's own model does not give."""
+    """Those of `protocol.EXTRA_MODES` to render in addition to the view."""
     without: tuple[str, ...] = ()
     """Cameras that are not used, neither their images nor their masks."""
     model: str | None = None
-    """The shipped model of "compared", and of "error" if given."""
+    """The shipped model whose view is the mode "compared"; if given, "error" and the score are about this view."""
     truth: str | None = None
-    """A camera whose image the view is scored by. It replaces `cameras`."""
+    """A rig camera that replaces `cameras`; the view is scored against its image."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class RenderResult:
     background: str = BLACK
     """Default background, as hexadecimal RGB: the model's own."""
     extra: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
-    """Images by mode of `RenderRequest.extra_modes`, one mapping per eye: RGB in [0, 1], times
+    """Images of `RenderRequest.extra_modes` by mode, one mapping per eye: RGB in [0, 1] multiplied by
     alpha, and alpha."""
     input_views: tuple[str, ...] = ()
     """Names of the cameras that coloured or completed the first eye's view, those that coloured it first."""
@@ -262,7 +262,7 @@ class Renderer:
         return self._inpainter.source_names(rendered) if is_predicted else rendered.source_views
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of these names that are cameras of the rig, in its order; ValueError if fewer than two are left."""
+        """The cameras of the rig with these names, in the rig's order; ValueError if fewer than two others are left."""
         own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
         if names and len(set(own) - set(names)) < 2:
             raise ValueError(
@@ -291,7 +291,7 @@ class Renderer:
             raise ValueError("expected a rig, got none yet; see /health")
         cached = None
         if not without or stream is not self._stream:
-            with suppress(ValueError):  # the stream does not have it: the hull is computed, and not kept
+            with suppress(ValueError):  # not in the stream: the hull is computed below, and not kept
                 cached = stream.cached_frame(frame.time)
         if cached is None:
             cached = cache_frame(frame.without(without).to(self._device), stream.bounds, stream.config.hull)
@@ -354,7 +354,7 @@ class Renderer:
         without: tuple[str, ...],
         quality: RenderQuality,
     ) -> CompletedView:
-        """The view by another model, behind the same geometry."""
+        """The view that another model completes, with the same geometry."""
         stream = self._stream_of(model, without)
         stream.adopt(cached)
         return stream.view(camera, None, cached.frame.time, replace(quality, mend=True)).completed
@@ -416,7 +416,7 @@ class Renderer:
     def _view(
         self, stream: Stream, camera: Cameras, viewer: State, index: int, quality: RenderQuality
     ) -> StreamView:
-        """One view; with its holes if the model fails."""
+        """Render and complete one view; if the model fails, the view keeps its holes."""
         if not quality.mend:
             return stream.view(camera, viewer, index, quality)
         try:

@@ -151,7 +151,7 @@ class LiveServer:
     def _guard(
         self, handler: Callable[[Request], Awaitable[Response]], needs_token: bool = True
     ) -> Callable[[Request], Awaitable[Response]]:
-        """The handler for requests with the token that come from the server's own page."""
+        """Wrap a handler: refuse requests from other sites' pages or without the token; turn errors into responses."""
 
         async def guarded(request: Request) -> Response:
             foreign = self._access.find_foreign_origin(request)
@@ -223,7 +223,7 @@ class LiveServer:
         return Response(image, media_type="image/jpeg", headers=headers)
 
     def _image_slot(self) -> asyncio.Semaphore:
-        """A context for one of the images that are rendered at a time; BusyError if there is none left."""
+        """The semaphore for single images, to be held while one is rendered; BusyError if too many are already."""
         if self._images.locked():
             raise BusyError(TOO_MANY_IMAGES)
         return self._images
@@ -269,12 +269,10 @@ class LiveServer:
         span = self._service.source.span
         version = self._service.renderer.assets_version
         if version is None or not span.first <= asked.time < span.end:
-            there = (
-                f"from {span.first} to {span.end - 1}"
-                if span.first < span.end
-                else "that exists (there is none yet)"
-            )
-            return error_response(404, f"expected a frame {there}, got {asked.time}; see /health")
+            available = "that exists (there is none yet)"
+            if span.first < span.end:
+                available = f"from {span.first} to {span.end - 1}"
+            return error_response(404, f"expected a frame {available}, got {asked.time}; see /health")
         try:
             without = self._service.renderer.left_out(asked.without.split(","))
             made = await self.assets.get(asked.time, version, without)

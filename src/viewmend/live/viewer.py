@@ -1,4 +1,4 @@
-"""The live server from Python: a script or a notebook starts it, and says what its pages show."""
+"""The live server from Python: a script or a notebook starts it, and controls what its pages show."""
 
 import threading
 from contextlib import ExitStack
@@ -18,6 +18,7 @@ from viewmend.models.registry import default_method, error_model_for, make_metho
 from viewmend.stream import StreamConfig
 
 STOP_S = 10.0
+"""`close` waits at most this many seconds for the server's thread."""
 
 
 class Viewer:
@@ -32,7 +33,7 @@ class Viewer:
     """
 
     def __init__(self, renderer: Renderer, source: RecordedSource, **address: Any) -> None:
-        """Start a server on a thread, which `serve` does; the other arguments are those of `ServerConfig`.
+        """Start a server on a thread, as `serve` does; `address` are fields of `ServerConfig`.
 
         Raises:
             ValueError: the port or budget_ms is out of range.
