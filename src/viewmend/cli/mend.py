@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from viewmend.data.source import CaptureSource
     from viewmend.geometry.bounds import Bounds
     from viewmend.geometry.cameras import Cameras
-    from viewmend.mending import Mender
+    from viewmend.mending import Mender, MendSummary
     from viewmend.models.base import Inpainter
     from viewmend.rendering.view import RenderConfig
     from viewmend.scenes.held_out import Protocol
 
 
 LARGE_PX = 1000
-"""For images with a longer side of more pixels than this, a long run is advised to use `--scale`."""
+"""Images with more pixels than this on their longer side take long; `--scale` is then recommended."""
 KEPT_MB = 300.0
 """Memory for earlier frames, in MB, if the model does not need them: an orbit may return to them."""
 
@@ -109,11 +109,8 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
     _check(options)
-    from viewmend.cli.checks import chosen_times, load_named, without_subject
-    from viewmend.cli.console import announce_duration, print_json, say, show, track
-    from viewmend.cli.mend_output import MendOutput, in_words
+    from viewmend.cli.checks import chosen_times, load_named
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
-    from viewmend.data.source import prefetch
     from viewmend.mending import MendSummary, default_protocol
 
     # Open and prepare the capture. Options are checked before anything is read.
@@ -127,16 +124,35 @@ def run(options: Options) -> int:
     protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
 
-    # Render and complete the views
+    # Render, complete and score the views
     mender = _make_mender(options, render, inpainter, capture.bounds, held, protocol)
     if turntable is not None and turntable.background:
         mender.background = turntable.background
-    summary = MendSummary(protocol)
     plan = _plan(options, capture, times, usable, turntable)
+    fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
+    summary = MendSummary(protocol)
+    _mend_views(options, mender, capture, plan, fps, summary)
+    _report(options, capture, plan, summary)
+    return 0
+
+
+def _mend_views(
+    options: Options,
+    mender: "Mender",
+    capture: "PreparedCapture",
+    plan: "list[tuple[int, Cameras]]",
+    fps: float,
+    summary: "MendSummary",
+) -> None:
+    """Complete and write all views, and add them to the summary."""
+    from viewmend.cli.console import announce_duration, say, track
+    from viewmend.cli.mend_output import MendOutput
+    from viewmend.data.source import prefetch
+
+    held = () if options.leave_out is None else (options.leave_out,)
     plan_times = [time for time, _ in plan]
     frames = prefetch(capture, [time for time, _ in groupby(plan_times)])  # views in a row share a frame
     frame = None
-    fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
             say(f"{options.out}: the results of an earlier run will be replaced")
@@ -149,16 +165,27 @@ def run(options: Options) -> int:
             summary.add(step)
             output.add(step)
 
-    # Report
+
+def _report(
+    options: Options,
+    capture: "PreparedCapture",
+    plan: "list[tuple[int, Cameras]]",
+    summary: "MendSummary",
+) -> None:
+    """Print where the results are, which frames were empty, and the scores."""
+    from viewmend.cli.checks import without_subject
+    from viewmend.cli.console import print_json, say, show
+    from viewmend.cli.mend_output import in_words
+
     say(f"wrote {options.out}")
     if summary.empty:
-        empty_frames = without_subject(capture, summary.empty, len(set(plan_times)))
+        num_frames = len({time for time, _ in plan})
+        empty_frames = without_subject(capture, summary.empty, num_frames)
         say(f"{empty_frames}; they show the background")
     if options.json:
         print_json(summary.as_json())
     else:
         show(*in_words(summary))
-    return 0
 
 
 def _check(options: Options) -> None:
@@ -287,7 +314,7 @@ def _plan(
 def _circle(
     turntable: "Turntable", capture: "CaptureSource", usable: list[int]
 ) -> "list[tuple[int, Cameras]]":
-    """The frame and the camera of each view of a turntable; every image is wide enough to show the whole motion."""
+    """The frame and the camera of each view of a turntable; each image has room for the whole motion."""
     import math
 
     import torch

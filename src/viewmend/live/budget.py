@@ -1,4 +1,4 @@
-"""Frame time: chooses the quality of a viewer's next view, and limits resolution so that all viewers are served soon.
+"""Frame time: chooses the quality of a viewer's next view, and keeps waits for other viewers' views short.
 
 docs/live.md describes the ladders of quality levels. The control law of `Budget`:
 
@@ -33,7 +33,7 @@ MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 """A step up that is undone within this many frames was wrong."""
 MAX_WAIT_S = 2.5
-"""The resolution is limited so that all waiting viewers get an image within this many seconds, one after the other."""
+"""The resolution is limited so that all waiting viewers, one after the other, are served within this time."""
 IDLE_WAIT_S = 1.0
 """Time limit for an image, in seconds, when other viewers are connected but idle."""
 MIN_MEASURED_PX = 20_000

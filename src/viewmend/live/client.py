@@ -175,7 +175,7 @@ class Client(Connection):
             self.send("on_air", on=True)
 
     def send(self, kind: str, **values: object) -> None:
-        """Send a message of the protocol; waits first if the server would reject one so soon after the others."""
+        """Send a message of the protocol; waits first if it would exceed the server's rate limit."""
         if self._max_per_s < math.inf:
             now = time.monotonic()
             rate = self._max_per_s

@@ -80,7 +80,7 @@ class CompletedAhead:
         self._failed: set[FrameKey] = set()
         """Frames of which a mesh or a view failed."""
         self._took_s = {"mesh": 0.0, "view": 0.0}
-        """Seconds that the last mesh and the last view took; one that was cancelled counts only if it took longer."""
+        """Seconds that the last mesh and the last view took; a cancelled one counts only if it took longer."""
         self._begun_s = -RETRY_S
         """When the last mesh or view was begun."""
         self.num_made = 0
@@ -119,7 +119,7 @@ class CompletedAhead:
         return next((image.asset for image in made if image.camera["number"] == number), None)
 
     def choose(self, shown: Sequence[ShownFrame]) -> AheadTask | None:
-        """What to make next for these frames, which are completed one after the other; None if nothing is due.
+        """The next mesh or view to make for the first of these frames that lacks one; None if nothing is due.
 
         A frame gets its mesh first, then its views, those closest to its viewer first.
         """
@@ -142,7 +142,7 @@ class CompletedAhead:
         return None
 
     def _is_worth_trying(self, kind: str, frame: ShownFrame) -> bool:
-        """Whether a mesh or a view is probably made before the next frame is shown, or this may be tried again."""
+        """Whether a mesh or a view would probably be made before the next frame is shown, or a retry is due."""
         return self._took_s[kind] < frame.interval_s or time.monotonic() - self._begun_s > RETRY_S
 
     def make(self, task: AheadTask) -> None:
@@ -175,7 +175,7 @@ class CompletedAhead:
             self._failed.add(task.key)
 
     def _keep(self, task: AheadTask, new: Asset | CompletedImage) -> None:
-        """Add a mesh or a view. If there is too little memory, the least recently completed frames are dropped."""
+        """Add a mesh or a view, and drop the frames that were added to least recently if memory is full."""
         made = self._made.setdefault(task.key, MadeAhead())
         self._made.move_to_end(task.key)
         self._size_bytes -= made.size_bytes()
@@ -202,7 +202,7 @@ class CompletedAhead:
 
 
 def _closest(numbers: Sequence[int], cameras: Cameras, eye: Cameras | None, home: HomeView) -> int:
-    """The number of the camera whose direction from the subject is closest to the eye's; the first without an eye."""
+    """The number of the camera that sees the subject from nearly where the eye does; the first without an eye."""
     if eye is None:
         return numbers[0]
     to_eye = F.normalize(eye.centers[0] - home.center, dim=0)

@@ -26,7 +26,7 @@ REJECTED_PER_S = 1.0
 REJECTED_AT_ONCE = 19.0
 """A client may send this many such messages in a burst."""
 STATE_S = 300.0
-"""The message `state` is repeated after this many seconds even if nothing has changed: pages' clocks drift."""
+"""The message `state` is repeated after this many seconds without a change, because pages' clocks drift."""
 RECENT_S = 2.0
 """A viewer that was sent a frame within this many seconds is not idle."""
 
@@ -345,7 +345,7 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
-        # A frame changes the statistics twice: when it is sent, and one second later, when it drops out of them.
+        # A frame changes the statistics twice: when it is sent, and when it drops out of them a second later.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -34,7 +34,7 @@ class Extension:
         return {}
 
     def handle(self, session: ViewerSession, message: Message) -> bool:
-        """Handle a viewer's message, under the service's lock; returns whether the message is for this extension."""
+        """Handle a viewer's message, under the service's lock; returns whether it is for this extension."""
         return False
 
     def leave(self, session: ViewerSession) -> None:

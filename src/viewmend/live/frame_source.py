@@ -155,7 +155,7 @@ class FrameSource(ABC):
 
     @abstractmethod
     def read(self, index: int) -> MultiViewFrame | None:
-        """The frame, or None while it is not in memory. Returns at once; the frame is read in the background."""
+        """The frame, or None while it is not in memory. Returns at once; reading goes on in the background."""
 
     def read_cached(self, index: int) -> CachedFrame | None:
         """The frame with the geometry and encodings that another process has computed; None if there are none."""

@@ -88,7 +88,7 @@ class SourceImageQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class TurntableQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The query of `GET /turntable`: how to frame a video around the subject so that its motion stays in view."""
+    """The query of `GET /turntable`: how to frame a video around the subject so that it stays in view."""
 
     time: protocol.Count
     """Index of the video's first frame."""
@@ -110,7 +110,7 @@ class TurntableQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def frame_motion(asked: TurntableQuery, points: Float[Tensor, "point 3"], home: HomeView) -> dict[str, Any]:
-    """Choose target, distance (metres) and focal length (pixels) so that all images of a turntable show all points."""
+    """Choose target, distance (metres) and focal length (pixels) so that a turntable shows all points."""
     center = (points.amin(0) + points.amax(0)) / 2
     azimuths = torch.deg2rad(asked.azimuth + asked.arc * torch.linspace(-0.5, 0.5, TURNTABLE_VIEWS)).tolist()
     elevation_rad = math.radians(asked.elevation)

@@ -58,7 +58,7 @@ class RenderRequest:
     without: tuple[str, ...] = ()
     """Cameras that are not used, neither their images nor their masks."""
     model: str | None = None
-    """The shipped model whose view is the mode "compared"; if given, "error" and the score are about this view."""
+    """The shipped model whose view is the mode "compared". If given, "error" and the score are of this view."""
     truth: str | None = None
     """A rig camera that replaces `cameras`; the view is scored against its image."""
 
@@ -262,7 +262,7 @@ class Renderer:
         return self._inpainter.source_names(rendered) if is_predicted else rendered.source_views
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The cameras of the rig with these names, in the rig's order; ValueError if fewer than two others are left."""
+        """The rig's cameras with these names, in its order; ValueError if fewer than two others are left."""
         own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
         if names and len(set(own) - set(names)) < 2:
             raise ValueError(

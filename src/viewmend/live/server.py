@@ -151,7 +151,7 @@ class LiveServer:
     def _guard(
         self, handler: Callable[[Request], Awaitable[Response]], needs_token: bool = True
     ) -> Callable[[Request], Awaitable[Response]]:
-        """Wrap a handler: refuse requests from other sites' pages or without the token; turn errors into responses."""
+        """Refuse requests from other sites' pages or without the token, and turn errors into responses."""
 
         async def guarded(request: Request) -> Response:
             foreign = self._access.find_foreign_origin(request)
@@ -223,7 +223,7 @@ class LiveServer:
         return Response(image, media_type="image/jpeg", headers=headers)
 
     def _image_slot(self) -> asyncio.Semaphore:
-        """The semaphore for single images, to be held while one is rendered; BusyError if too many are already."""
+        """The semaphore to hold while a single image is rendered; BusyError if too many images are."""
         if self._images.locked():
             raise BusyError(TOO_MANY_IMAGES)
         return self._images

@@ -78,7 +78,7 @@ class RenderService:
             self._thread.join(timeout=5)
 
     def wake(self) -> None:
-        """Note that the source has changed: check at once whether a session needs a view, and call `changed`."""
+        """Check at once whether a session needs a view, and call `changed`, because the source has changed."""
         with self.lock:
             self.lock.notify_all()
         self.changed()
@@ -106,10 +106,7 @@ class RenderService:
         return self.renderer.home is not None and self.renderer.is_prepared_for(self.source.rig)
 
     def advance_edge(self) -> float:
-        """Advance the edge to now, and return it: the frame that all viewers who follow it are shown, with fractions.
-
-        This is the newest frame of a live rig, or the common playback position in a recording.
-        """
+        """Advance the edge to now; returns it as `FrameSource.edge` does."""
         with self.lock:
             now = self.now()
             self.source.recording.advance(now - self._edge_advanced_s, self.source.span)

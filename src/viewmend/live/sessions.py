@@ -169,7 +169,7 @@ class ViewerSession:
         self.is_cancelled = True
 
     def _cancel_view_at_rest(self) -> None:
-        """Cancel the last request if its view was for a viewer at rest; while a viewer moves, all views are sent."""
+        """Cancel the last request if it was for a viewer at rest; a moving viewer is sent every view."""
         look = self.requested.look
         self.is_cancelled |= look is not None and (look.full or self._is_refinement)
 
@@ -188,7 +188,7 @@ class ViewerSession:
         return self.wanted_look is not None and self.wanted_look is not self.requested.look
 
     def is_up_to_date(self, span: Span, edge: float) -> bool:
-        """Whether no view is left to render: the wanted look was rendered as well as possible, or there is none."""
+        """Whether no view is left to render, because the best view of the wanted look was, or there is no look."""
         if self.wanted_look is None:
             return True
         is_requested = not self._has_new_look and self.advance_clock(span, edge) == self.requested.index
@@ -206,7 +206,7 @@ class ViewerSession:
         return ShownFrame(index, () if look is None else look.without, eye, interval_s)
 
     def advance_clock(self, span: Span, edge: float) -> int:
-        """Advance the viewer's clock to now; returns the index of the frame to show, -1 while there is none."""
+        """Advance the viewer's clock to now; returns the index of the frame to show, -1 if there is none."""
         now = self._now()
         self.clock.advance(now - self._clock_advanced_s, span, edge)
         self._clock_advanced_s = now
@@ -220,7 +220,7 @@ class ViewerSession:
         self._cancel_view_at_rest()
 
     def is_active(self, now: float) -> bool:
-        """Whether a frame was sent within the last second, or the viewer waits for the first view of a look."""
+        """Whether a frame was sent within the last second, or the viewer waits for a look's first view."""
         return (self._has_new_look and self.in_flight is None) or self.sent_since(now - 1)
 
     def sent_since(self, since_s: float) -> bool:
@@ -233,7 +233,7 @@ class ViewerSession:
             self.in_flight = None
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
-        """The wanted look at the clock's frame, or the same view again at a better level; None for no view."""
+        """The wanted look at the clock's frame, or the same view at a better level; None if no view is due."""
         self.buffering = False
         look = self.wanted_look
         if look is None or self.in_flight is not None:
@@ -272,7 +272,7 @@ class ViewerSession:
     def _next_level(
         self, look: Look, is_new: bool, now: float, playback: PlaybackState
     ) -> QualityLevel | None:
-        """The level of a new view, or a better one for a view that is still; None if there is nothing to render."""
+        """The level of a new view, or a better one for a view that is still; None if no view is due."""
         plays = self.clock.playing and playback.span.fps > 0
         is_at_rest = not look.moving and not plays
         if not is_new:
@@ -300,7 +300,7 @@ class ViewerSession:
         return None
 
     def _better_level(self, still_s: float) -> QualityLevel | None:
-        """A better level than the requested one, for a view that has been still for this long; None if none is due."""
+        """A better level for a view that has been still for this many seconds; None if none is due."""
         if self._is_final:
             return None
         cost = self._chosen_level.relative_cost

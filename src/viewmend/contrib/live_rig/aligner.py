@@ -1,4 +1,4 @@
-"""Synchronisation: groups the cameras' images, which arrive in any order, by the time at which they were taken.
+"""Synchronisation: groups the cameras' images, which arrive in any order, by the time of their exposure.
 
 The rig shows a frame at each of its ticks, which are evenly spaced in time. Each camera contributes
 the image that was taken closest to the tick.
@@ -15,11 +15,11 @@ from viewmend.data.camera_images import CameraImages
 ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""
 PHASE_GAIN = 0.05
-"""The ticks follow the cameras: each group moves later ticks by this fraction of its images' median offset."""
+"""The ticks follow the cameras: each group moves them by this fraction of its images' median offset."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""Up to this many complete groups wait to be taken; the oldest are dropped if there are more."""
+"""The largest number of complete groups that wait to be taken; the oldest are dropped."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ MIN_WAIT_S = 0.002
 """If the reader waited longer than this for a packet, in seconds, the packet has just arrived;
 otherwise it may have been in a queue."""
 DAMAGED_S = 2.0
-"""After a damaged image, all others are dropped until the next key frame, but at most for this many seconds."""
+"""Images that follow a damaged one are dropped until the next key frame, for at most this many seconds."""
 ROUNDING_S = 1e-6
 """Times of a recording that differ by less than this many seconds are the same."""
 FFMPEG_OPTIONS = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
@@ -66,7 +66,7 @@ class Playback:
     def __init__(self, length_s: float = 1.0) -> None:
         self.start_s = time.monotonic()
         self.length_s = length_s
-        """The length of a lap, after which all recordings start again: up to the end of the first that ends."""
+        """The length of a lap. When the first recording ends, all of them start again."""
         self.shifts_s: dict[str, float] = {}
         """The position of each recording's time 0 on the timeline, in seconds; the earliest image of all
         is at 0. A recording that is not listed begins with its first image at 0."""
@@ -236,6 +236,6 @@ class DamageFilter:
         return True
 
     def _count_rejected(self) -> None:
-        """Count a rejected image, unless none was accepted yet: a stream joined in the middle may begin with some."""
+        """Count a rejected image; those at the start, where a stream was joined in its middle, do not count."""
         if self._has_begun:
             self._counts["torn"] += 1

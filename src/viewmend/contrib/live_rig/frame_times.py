@@ -40,7 +40,7 @@ class ArrivalTimes:
         return arrived_s
 
     def is_new(self, frame: "VideoFrame", counts: "Counter[str]") -> bool:
-        """Whether the image's timestamp differs from the previous image's; counts it as "duplicated" if not."""
+        """Whether the image's timestamp differs from the previous one; counts a "duplicated" image if not."""
         is_repeated = frame.pts is not None and frame.pts == self._last_pts
         self._last_pts = frame.pts
         counts["duplicated"] += is_repeated

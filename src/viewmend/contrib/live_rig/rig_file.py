@@ -128,7 +128,9 @@ class LiveRig:
 
 
 def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
-    """Read a `rig.toml` and its calibration; images are to be reduced to `max_image_size` on their longer side.
+    """Read a `rig.toml` and its calibration.
+
+    The calibration is for images whose longer side is reduced to `max_image_size`.
 
     Raises:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
@@ -175,7 +177,7 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file():
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # Another file with the same suffix is taken for another calibration; with another suffix, for a part of this one.
+    # Another file is taken for another calibration if it has the same suffix, otherwise for a part of this one.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

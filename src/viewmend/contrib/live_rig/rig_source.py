@@ -145,7 +145,7 @@ class RigFileSource(LiveSource):
             if timecode_note is not None:
                 log.warning("%s", timecode_note)
 
-        # The new rig takes over, with the event counts of unchanged cameras. `--fps` overrides the file's rate.
+        # The new rig keeps the event counts of unchanged cameras. `--fps` overrides the file's rate.
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
         with self._cameras_lock:
@@ -228,7 +228,7 @@ class RigFileSource(LiveSource):
         self.add(self._prepared.adjust(frame, label="the newest frame"))
 
     def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
-        """Check, align and colour-match the rig by its first frame; None if fewer than two masks show a subject."""
+        """Check, align and colour-match the rig by its first frame; None if fewer than two masks have a subject."""
         assert frame.mask is not None, "live cameras are masked"
         num_subjects = (frame.mask.amax((1, 2)) > FOREGROUND).sum()
         if int(num_subjects) < 2:

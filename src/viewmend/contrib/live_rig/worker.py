@@ -63,8 +63,9 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
     height, width = plate.shape[:2]
     if (width, height) != camera.sent_px:
         expected = "{} x {}".format(*camera.sent_px)
+        got = f"{width} x {height}"
         raise CaptureError(
-            f"{where}: expected {expected} pixels as the calibration says, got {width} x {height}; take it again"
+            f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again"
         )
     return PlateMasks(reduce_image(plate, mask_size_px(camera)))
 
@@ -186,7 +187,7 @@ class CameraWorker:
             self._deliver(self.camera.name, decoded.taken_s, images)
 
     def _process(self, decoded: DecodedImage) -> CameraImages:
-        """The reduced and undistorted image, and its mask; ValueError if its size is not the calibration's."""
+        """The reduced and undistorted image with its mask; ValueError if its size is not the calibration's."""
         import cv2
 
         frame = decoded.frame
