@@ -12,7 +12,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from viewmend.live import protocol
 from viewmend.live.assets import FrameKey
 from viewmend.live.auth import RateLimit
-from viewmend.live.protocol import Ack, Cancel, ClockChange, Hello, Look, Message, Ping, ProtocolError
+from viewmend.live.protocol import (
+    Ack,
+    Cancel,
+    ClockChange,
+    CloseCode,
+    Hello,
+    Look,
+    Message,
+    Ping,
+    ProtocolError,
+)
 from viewmend.live.registry import SessionRegistry, SharedState
 from viewmend.live.sessions import ViewerSession
 from viewmend.rendering.error_mask import ERROR_RULES
@@ -35,12 +45,11 @@ RECENT_S = 2.0
 class ClosingError(Exception):
     """Ends a connection with an error message."""
 
-    code: int
-    """The WebSocket's close code."""
+    code: CloseCode
     message: str
 
 
-async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
+async def close_with_error(socket: WebSocket, code: CloseCode, message: str) -> None:
     """Send an error message and close a socket."""
     await socket.send_text(json.dumps(protocol.error_json(code, message, fatal=True)))
     await socket.close(code)
@@ -122,7 +131,9 @@ class ViewerConnection:
         limit = self._registry.limits.viewers
         try:
             if len(sessions) >= limit:
-                raise ClosingError(4503, f"expected at most {limit} viewers; try again later")
+                raise ClosingError(
+                    CloseCode.TOO_MANY_VIEWERS, f"expected at most {limit} viewers; try again later"
+                )
             sessions.append(self._session)
             await self._shake_hands()
             self._service.join(self._session)
@@ -147,14 +158,19 @@ class ViewerConnection:
             async with asyncio.timeout(HELLO_S):
                 hello = protocol.parse(await self._receive(), self._registry.limits)
         except TimeoutError:
-            raise ClosingError(4408, f"expected a hello within {HELLO_S:g} s; reconnect") from None
+            raise ClosingError(
+                CloseCode.TIMEOUT, f"expected a hello within {HELLO_S:g} s; reconnect"
+            ) from None
         except ProtocolError as error:
-            raise ClosingError(4400, str(error)) from None
+            raise ClosingError(CloseCode.MALFORMED, str(error)) from None
         if not isinstance(hello, Hello):
-            raise ClosingError(4400, "expected 'hello' as the first message; see docs/live-protocol.md")
+            raise ClosingError(
+                CloseCode.MALFORMED, "expected 'hello' as the first message; see docs/live-protocol.md"
+            )
         if hello.version != protocol.VERSION:
             raise ClosingError(
-                4426, f"expected version {protocol.VERSION}, got {hello.version}; reload the page"
+                CloseCode.VERSION_MISMATCH,
+                f"expected version {protocol.VERSION}, got {hello.version}; reload the page",
             )
         about = self._registry.about
         welcome = about | {
@@ -200,11 +216,13 @@ class ViewerConnection:
                     continue
                 await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
                 limit = self._registry.limits.messages_per_s
-                self._reject(4429, f"expected at most {limit} messages a second; send fewer")
+                self._reject(
+                    CloseCode.TOO_MANY_MESSAGES, f"expected at most {limit} messages a second; send fewer"
+                )
             except ProtocolError as error:
-                self._reject(4400, str(error))
+                self._reject(CloseCode.MALFORMED, str(error))
 
-    def _reject(self, code: int, message: str) -> None:
+    def _reject(self, code: CloseCode, message: str) -> None:
         """Answer a client's message with an error, or close the connection if there are too many."""
         if not self._rejected.allow():
             raise ClosingError(code, message)
@@ -294,7 +312,7 @@ class ViewerConnection:
             self._send_made_ahead()
 
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
-            self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
+            self.fail(ClosingError(CloseCode.TIMEOUT, f"expected an ack within {ACK_S:g} s; reconnect"))
 
         # An idle viewer needs nothing until its state is repeated; any other is due at every check.
         gets_views = (

@@ -4,6 +4,7 @@ import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import quote
 
@@ -60,6 +61,16 @@ BLACK = "000000"
 WHITE = "ffffff"
 ShortText = Annotated[str, Meta(max_length=40)]
 Names = Annotated[tuple[ShortText, ...], Meta(max_length=128)]
+
+
+class CloseCode(IntEnum):
+    """Codes with which the server closes a WebSocket, and which errors that do not close it have, too."""
+
+    MALFORMED = 4400
+    TIMEOUT = 4408
+    VERSION_MISMATCH = 4426
+    TOO_MANY_MESSAGES = 4429
+    TOO_MANY_VIEWERS = 4503
 
 
 class ProtocolError(InputError):

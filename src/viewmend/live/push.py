@@ -23,7 +23,15 @@ from viewmend.live import protocol
 from viewmend.live.connection import close_with_error
 from viewmend.live.connection_limits import authenticate, is_gone
 from viewmend.live.frame_source import FrameCache, FrameSource, RigInfo, SourceStatus, Span
-from viewmend.live.protocol import HEADER_BYTES, Point, ProtocolError, Rotation, check_rotation, read_message
+from viewmend.live.protocol import (
+    HEADER_BYTES,
+    CloseCode,
+    Point,
+    ProtocolError,
+    Rotation,
+    check_rotation,
+    read_message,
+)
 from viewmend.types import MultiViewFrame
 from viewmend.utils.untrusted_input import one_of
 
@@ -93,7 +101,9 @@ async def receive_rig(socket: WebSocket, source: PushSource) -> None:
             async with asyncio.timeout(SILENT_S):
                 message = await socket.receive()
         except TimeoutError:
-            await close_with_error(socket, 4408, f"expected a frame within {SILENT_S:g} s; reconnect")
+            await close_with_error(
+                socket, CloseCode.TIMEOUT, f"expected a frame within {SILENT_S:g} s; reconnect"
+            )
             return
         if message["type"] == "websocket.disconnect":
             return
@@ -110,7 +120,7 @@ async def receive_rig(socket: WebSocket, source: PushSource) -> None:
                     return
                 index = source.add(frame)
         except ValueError as error:
-            await close_with_error(socket, 4400, str(error))
+            await close_with_error(socket, CloseCode.MALFORMED, str(error))
             return
         await socket.send_text(json.dumps({"type": "taken", "frame": index}))
 
