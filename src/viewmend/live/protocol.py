@@ -64,7 +64,7 @@ Names = Annotated[tuple[ShortText, ...], Meta(max_length=128)]
 
 
 class CloseCode(IntEnum):
-    """Codes with which the server closes a WebSocket, and which errors that do not close it have, too."""
+    """Codes of the message `error`, and of a WebSocket that the server closes because of the error."""
 
     MALFORMED = 4400
     TIMEOUT = 4408

@@ -186,12 +186,12 @@ class RenderService:
         Nothing is made ahead while a viewer or a job needs a view. What is being made is cancelled as
         soon as one does, or no page shows the frame any more. Called on the render thread.
         """
-        task = self.ahead.choose(self._frames_to_enrich())
+        task = self.ahead.choose(self._shown_frames_if_idle())
         if task is None or self.source.read(task.frame) is None:
             return False
 
         def is_needless() -> bool:
-            return self._stopped or task.key not in [shown.key for shown in self._frames_to_enrich()]
+            return self._stopped or task.key not in [shown.key for shown in self._shown_frames_if_idle()]
 
         try:
             with cancellable(is_needless):
@@ -203,8 +203,8 @@ class RenderService:
         self.changed()
         return True
 
-    def _frames_to_enrich(self) -> list[ShownFrame]:
-        """The frames that pages show; none while a viewer or a job needs a view, which takes precedence."""
+    def _shown_frames_if_idle(self) -> list[ShownFrame]:
+        """The frames that pages show if no viewer or job needs a view; otherwise none."""
         home = self.renderer.home
         if home is None or not self.is_ready:
             return []

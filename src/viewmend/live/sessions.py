@@ -285,8 +285,8 @@ class ViewerSession:
     def _available_frame(self, due: int, now: float, playback: PlaybackState) -> int | None:
         """The frame to render if it is in memory; None while it is being read.
 
-        This is the frame that is due. A playing viewer that waits for an earlier frame keeps waiting
-        for that one, though: frames that are read too late for the clock would never be shown otherwise.
+        This is the frame that is due. But a playing viewer that has requested an earlier frame keeps
+        waiting for it: if frames are read more slowly than they play, none would be shown otherwise.
         """
         awaited = self._awaited
         is_behind = self.clock.playing and playback.span.first <= awaited.index < due

@@ -105,9 +105,8 @@ class Aligner:
         """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
         counts = self.counts[name]
         self._heard_s[name] = now_s
-        if (
-            timed.taken_s > now_s + self._interval_s / 2
-        ):  # the camera's clock is wrong: no tick may depend on it
+        # An image from the future is dropped before it can affect ticks: the camera's clock is wrong.
+        if timed.taken_s > now_s + self._interval_s / 2:
             counts["misaligned"] += 1
             return
         tick = self._nearest(timed.taken_s)
