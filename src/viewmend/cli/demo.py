@@ -24,7 +24,7 @@ MIN_GAP = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Render and complete a moving procedural scene, captured by six cameras, from a moving camera. Needs no data.
+    """Render and complete a procedural scene, captured by six cameras, from a moving camera. It needs no data.
 
     OUT gets demo.mp4 (rendered, completed and true views side by side) and contact_sheet.png. The
     table compares the rendered view, OpenCV's Telea and the model with the truth.
@@ -44,7 +44,7 @@ class Options:
     model: str | None = None
     """Name of a shipped model, or a model's folder; 'telea' and 'nearest' are classical fills."""
     json: bool = False
-    """Write the table as one JSON object to standard output and nothing else there."""
+    """Write the table to standard output as one JSON object, and nothing else."""
 
 
 def run(options: Options) -> int:
@@ -52,7 +52,7 @@ def run(options: Options) -> int:
     check_least(options, frames=1, size=1, cameras=1)
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, show, track
-    from viewmend.cli.mend_output import in_words
+    from viewmend.cli.mend_output import as_text
     from viewmend.data.source import prefetch
     from viewmend.mending import Mender, MendSummary, default_protocol
     from viewmend.models.registry import error_model_for
@@ -93,7 +93,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(summary.as_json())
     else:
-        show(*in_words(summary))
+        show(*as_text(summary))
     return 0
 
 

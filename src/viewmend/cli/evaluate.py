@@ -39,8 +39,8 @@ class RunOptions:
     out: Path
     """Folder for the results."""
     weights: Path | None = None
-    """Folder of published weights, searched first; without weights, methods and metrics are n/a
-    (viewmend weights)."""
+    """Folder of published weights, searched before the others (viewmend weights). Methods and
+    metrics whose weights are not found are n/a."""
     performers: Path | None = None
     """Folder of the people of set Q: glTF characters in it or in test/; BVH motions in
     motions/test/, in motions/, or next to the characters."""
@@ -52,33 +52,31 @@ class RunOptions:
     """Input cameras of a capture: all, or a number of evenly spaced ones; several values are
     separated by commas."""
     protocol: Literal["strict", "predicted-mask", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the mask of the held-out camera. 'strict': nothing. 'predicted-mask': nothing, but
-    the alpha that 'views' predicts takes its place. 'target-mask': the mask cuts and composites the
-    view, as in the paper. 'hull-with-target-mask': the mask only carves the hull."""
+    """How the mask of the held-out camera is used. 'strict': not at all. 'predicted-mask': not at
+    all, and the alpha that 'views' predicts replaces it. 'target-mask': to cut out and composite
+    the view, as in the paper. 'hull-with-target-mask': only to carve the hull."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None
     """Number of frames of each scene; by default 10 of P and Q, and all of a capture. Long sets
     have 41, of which the last 10 are scored."""
     every: int = 1
-    """Use one scene in n of each set, for a quick look at all kinds of scenes; of a capture, every
-    n-th camera."""
+    """Use only every n-th scene of each set, and every n-th camera of a capture, for a quick run."""
     scenes: int | None = None
-    """Largest number of scenes of each set, after --every."""
+    """Use at most this many scenes of each set, after --every."""
     size: int = 512
     """Width and height of the views of P, Q and the long sets, in pixels."""
     background: Literal["black", "stage"] = "black"
-    """What is behind the people of P; a stage is for models without masks."""
+    """Background behind the people of P; 'stage' is for models without masks."""
     score_background: Literal["black", "white"] = "black"
     """Background on which views and truth are scored. The paper uses white; whole-image scores on different
     backgrounds are not comparable."""
     ssim: Literal["gaussian", "uniform7"] = "gaussian"
     """Window of SSIM: Gaussian of 11 x 11 pixels, or uniform of 7 x 7."""
     jobs: int = 1
-    """Number of processes. Milliseconds are comparable only within a run."""
+    """Number of processes. Times are comparable only within a run."""
     ray: str | None = None
-    """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs
-    viewmend[ray])."""
+    """Address of a Ray cluster to run on instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "hull"
@@ -91,7 +89,7 @@ class RunOptions:
     top_k: int | None = None
     """Number of context tokens that the paper's model keeps when pruning; by default the model's own."""
     shown: int = 12
-    """Scenes of each set with images in report.html; sheets/ has all of them."""
+    """Number of scenes of each set whose images are in report.html; sheets/ has those of all scenes."""
 
 
 @dataclass(frozen=True, kw_only=True)

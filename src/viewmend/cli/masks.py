@@ -37,9 +37,9 @@ class Options:
     network: Path | None = None
     """ONNX file for --method onnx: a matting network that takes an image, or an image and its clean plate."""
     no_clean: bool = False
-    """Do not correct masks by those of other cameras and neighbouring frames."""
+    """Do not use other cameras and neighbouring frames to correct masks."""
     no_despill: bool = False
-    """Do not remove a screen's or plate's green or blue spill from the outline."""
+    """Do not remove colour that a green or blue screen, or a plate, casts on the outline."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     frames: str | None = None
@@ -92,7 +92,7 @@ def run(options: Options) -> int:
 
 
 def _describe_notes(masked: "MaskedCapture") -> list[str]:
-    """Lines that say what comparing the cameras has changed; cameras with equal changes share one."""
+    """Lines about what the comparison of cameras has changed; cameras with the same change share a line."""
     notes = masked.notes
     ids = masked.frame_ids
     alike: dict[tuple[str, str], list[str]] = {}

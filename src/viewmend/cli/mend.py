@@ -175,7 +175,7 @@ def _report(
     """Print where the results are, which frames were empty, and the scores."""
     from viewmend.cli.checks import without_subject
     from viewmend.cli.console import print_json, say, show
-    from viewmend.cli.mend_output import in_words
+    from viewmend.cli.mend_output import as_text
 
     say(f"wrote {options.out}")
     if summary.empty:
@@ -185,7 +185,7 @@ def _report(
     if options.json:
         print_json(summary.as_json())
     else:
-        show(*in_words(summary))
+        show(*as_text(summary))
 
 
 def _check(options: Options) -> None:

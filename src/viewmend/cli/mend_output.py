@@ -52,13 +52,13 @@ class MendOutput:
         self._count = 0
         self._rows: list[list[Tile]] = []
         self._stride = 1
-        """Every view of this stride is a row of the contact sheet; it doubles when the sheet is full."""
+        """The contact sheet has a row for each n-th view; n doubles when the sheet is full."""
 
     def __enter__(self) -> "MendOutput":
         """Lock the folder.
 
         Raises:
-            ValueError: there are files of no earlier run, or another run writes there.
+            ValueError: the folder has files of these names that no run wrote, or another run writes there.
             OSError: the folder cannot be created.
         """
         self._folder.__enter__()
@@ -78,12 +78,14 @@ class MendOutput:
         """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
         completed = step.completed
         number = f"{self._count:06d}.png"
-        shown = {
+        images = {
             "completed": step.completed_rgb,
             "holes": completed.view.error[None],
             "rendered": step.rendered,
         }
-        for name, image in (shown if step.truth is None else shown | {"true": step.truth}).items():
+        if step.truth is not None:
+            images["true"] = step.truth
+        for name, image in images.items():
             write_image(self._draft / name / number, picture(image))
         if self._alpha:
             write_image(self._draft / "cutout" / number, cutout(completed))
@@ -184,8 +186,8 @@ def _box(mask: Tensor) -> tuple[slice, slice]:
     return slice(max(0, top - margin), bottom + 1 + margin), slice(max(0, left - margin), right + 1 + margin)
 
 
-def in_words(summary: MendSummary) -> list[str]:
-    """The scores and times of a run as text."""
+def as_text(summary: MendSummary) -> list[str]:
+    """The scores and times of a run, as lines of text."""
     iou = [value for values in summary.hull_iou.values() for value in values]
     lines = [
         f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
@@ -195,10 +197,11 @@ def in_words(summary: MendSummary) -> list[str]:
     ]
     if summary.mean("ours", "psnr_whole") is None:
         return lines
-    whole, rendered = (in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled"))
+    whole = in_db(summary.mean("ours", "psnr_whole"))
+    whole_rendered = in_db(summary.mean("unfilled", "psnr_whole"))
     lines += [
         f"PSNR on {summary.background}, dB; protocol {summary.protocol}",
-        f"  whole image           {whole}   rendered {rendered}",
+        f"  whole image           {whole}   rendered {whole_rendered}",
         f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}",
         f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}",
     ]
@@ -206,13 +209,13 @@ def in_words(summary: MendSummary) -> list[str]:
         ours = summary.mean("ours", metric)
         telea = summary.mean("telea", metric)
         lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
-    ours = summary.mean("ours", "lpips_alex_whole")
-    if ours is None:
+    lpips = summary.mean("ours", "lpips_alex_whole")
+    if lpips is None:
         return lines
-    rendered = summary.mean("unfilled", "lpips_alex_whole")
-    subject = summary.mean("ours", "lpips_alex_subject")
+    lpips_rendered = summary.mean("unfilled", "lpips_alex_whole")
+    lpips_subject = summary.mean("ours", "lpips_alex_subject")
     lines += [
         "LPIPS (AlexNet), lower is better",
-        f"  whole image           {ours:.3f}   rendered {rendered:.3f}",
+        f"  whole image           {lpips:.3f}   rendered {lpips_rendered:.3f}",
     ]
-    return lines if subject is None else [*lines, f"  subject               {subject:.3f}"]
+    return lines if lpips_subject is None else [*lines, f"  subject               {lpips_subject:.3f}"]

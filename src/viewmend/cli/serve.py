@@ -1,4 +1,4 @@
-"""`viewmend serve`: a page on which a person moves around the subject, live."""
+"""`viewmend serve`: a web page for moving around the subject, live."""
 
 import os
 import time
@@ -120,25 +120,22 @@ def run(options: Options) -> int:
     config = server_config(options)
     source = open_source(options)
     inpainter = load_inpainter(options)
-    device = options.device
-    errors = error_model_for(inpainter, device)
-    in_page = config.draws_in_page
     renderer = Renderer(
         source,
         inpainter,
         stream_config(options),
-        device,
-        errors,
-        draws_in_page=in_page,
+        options.device,
+        error_model_for(inpainter, options.device),
+        draws_in_page=config.draws_in_page,
         precision=options.precision,
         completed_cameras=MAX_COMPLETED,
     )
     live = LiveServer(RenderService(renderer, source), config)
     server = Server(live, config)
-    with server.bind() as address:
+    with server.bind() as local_address:
         freeze_loaded_objects()
         query = token_query(config.token)
-        address = (config.public_url or address).rstrip("/")
+        address = (config.public_url or local_address).rstrip("/")
         say(f"open {address}/{query}   (Ctrl-C stops it)")
         for extension in live.extensions:
             if extension.notice:
@@ -195,7 +192,7 @@ def server_config(options: Options) -> "ServerConfig":
 
 
 def stream_config(options: Options) -> "StreamConfig":
-    """How frames become views."""
+    """Parameters of geometry, rendering and memory."""
     from viewmend.stream import StreamConfig
 
     return StreamConfig(render=options.view.config(), memory_mb=options.memory_mb / 2)
@@ -270,11 +267,13 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
         say(
             "Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)"
         )
-    elsewhere: dict[str, Any] = {"source": _absolute(options.source)}
-    elsewhere["view"] = replace(options.view, error_rule=_absolute(options.view.error_rule))
-    if options.model not in (*shipped_models(), *METHODS):  # which a folder of the same name does not replace
-        elsewhere["model"] = _absolute(options.model)
-    remote = replace(options, **elsewhere)
+
+    # Ray's processes have other working directories. The name of a method is never taken for a folder.
+    absolute: dict[str, Any] = {"source": _absolute(options.source)}
+    absolute["view"] = replace(options.view, error_rule=_absolute(options.view.error_rule))
+    if options.model not in (*shipped_models(), *METHODS):
+        absolute["model"] = _absolute(options.model)
+    remote = replace(options, **absolute)
     settings = import_object(RAY_SETTINGS)(
         open_source=partial(open_source, remote),
         load_inpainter=partial(load_inpainter, remote),
@@ -287,7 +286,7 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
     # Ray has a signal handler of its own.
     with import_object(SERVE_ON_RAY)(settings, address) as url, exit_on_sigterm():
         say(f"open {(config.public_url or url).rstrip('/')}/{token_query(config.token)}   (Ctrl-C stops it)")
-        while True:  # returns to this thread now and then, which has to handle signals
+        while True:  # Python handles signals in this thread, between two sleeps
             time.sleep(0.5)
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from viewmend.training.run_files import Progress
 
 OVERFIT_DB = 0.2
-"""Extra gain on the views of the training, in dB, from which a run is said to memorise its samples."""
+"""A run that gains this much more, in dB, on its training views than on new views memorises its samples."""
 DEFAULT = "views"
 """The recipe if none is named."""
 

@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """List the third-party weights that metrics and baselines can use, and verify those that are there.
+    """List the third-party weights that metrics and baselines can use, and verify those that are installed.
 
     Metrics and baselines without weights are n/a. LPIPS with AlexNet ships with this package, and
-    viewmend weights get downloads the other metrics' networks. Put all others into one of the
-    listed folders, or name a folder in VIEWMEND_WEIGHTS.
+    `viewmend weights get` downloads the networks of other metrics. Put any other weights into one of
+    the listed folders, or into the folder that VIEWMEND_WEIGHTS names.
     """
 
     json: bool = False
-    """Write one JSON value to standard output and nothing else there."""
+    """Write the list to standard output as JSON, and nothing else."""
 
 
 def run(options: Options) -> int:
@@ -54,7 +54,13 @@ def _describe(known: "KnownWeights", path: Path | None) -> dict[str, str]:
             status = "wrong"
             problem = str(error)
     return {
-        **{"name": known.name, "status": status, "path": "" if path is None else str(path)},
-        **{"files": " or ".join(known.files), "what": known.what, "source": known.source},
-        **{"licence": known.licence, "hash": stated_hash(known), "error": problem},
+        "name": known.name,
+        "status": status,
+        "path": "" if path is None else str(path),
+        "files": " or ".join(known.files),
+        "what": known.what,
+        "source": known.source,
+        "licence": known.licence,
+        "hash": stated_hash(known),
+        "error": problem,
     }
