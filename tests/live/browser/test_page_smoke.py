@@ -45,7 +45,7 @@ def test_all_comes_from_this_server(page):
 def test_a_pose_is_what_the_protocol_says(page):
     pose = {"target": [0.1, 0.9, 0.2], "azimuth": 50, "elevation": 20, "roll": 0, "distance": 2.5, "fov": 40}
     rig = scene.rig()
-    got = call(page, "view/pose.js", "return m.extrinsicsOf(x[0], x[1])", [rig, pose])
+    got = call(page, "view/pose.js", "return m.extrinsicsFromPose(x[0], x[1])", [rig, pose])
     a, e = np.deg2rad([50, 20])
     eye = np.array(pose["target"]) + 2.5 * np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
     forward = (np.array(pose["target"]) - eye) / 2.5
@@ -65,8 +65,8 @@ def test_the_pose_of_a_camera_is_that_camera(page, roll):
         "distance": 3,
         "fov": 40,
     }
-    body = """const [rig, pose] = x, c = m.extrinsicsOf(rig, pose);
-              return [c, m.extrinsicsOf(rig, m.poseOfCamera(rig, c, rig.center, 40))]"""
+    body = """const [rig, pose] = x, c = m.extrinsicsFromPose(rig, pose);
+              return [c, m.extrinsicsFromPose(rig, m.poseFromCamera(rig, c, rig.center, 40))]"""
     there, back = call(page, "view/pose.js", body, [scene.rig(), pose])
     np.testing.assert_allclose(back["R"], there["R"], atol=1e-9)
     np.testing.assert_allclose(back["T"], there["T"], atol=1e-9)
@@ -88,7 +88,7 @@ def test_depth_is_unpacked(page, rng):
 def test_the_size_asked_for_keeps_the_shape_and_the_limits(page):
     def size(width: int, height: int, side: int, limits: dict) -> tuple[int, int]:
         box = {"left": 0, "top": 0, "width": width, "height": height}
-        got = call(page, "view/lens.js", "return m.sizeFor(...x)", [box, side, limits])
+        got = call(page, "view/lens.js", "return m.chooseSize(...x)", [box, side, limits])
         return got["width"], got["height"]
 
     wide = {"max_side_px": 4096, "max_pixels": 10**7}
@@ -128,7 +128,7 @@ def test_a_surface_is_cut_at_jumps_in_depth_and_whole_elsewhere(page):
     z[:, 4:] = 4.0
     z[0] = 0
     depth = {"width": 8, "height": 6, "stride": 2, "z": z.ravel().tolist()}
-    body = """const s = m.surfaceOf({...x, z: Float32Array.from(x.z)}, 16, 12);
+    body = """const s = m.buildSurface({...x, z: Float32Array.from(x.z)}, 16, 12);
               return [[...s.vertices], [...s.solid], [...s.stretched]]"""
     vertices, solid, stretched = call(page, "draw/surface.js", body, depth)
     vertices = np.reshape(vertices, (-1, 5))

@@ -1,26 +1,20 @@
-// The page of a server: frames, completed views, images and films come from it.
+// The viewer of a live server, which provides frames, completed views, images and videos.
 
 import { Assets } from "./link/assets.js";
-import { address } from "./link/address.js";
+import { buildAddress } from "./link/address.js";
 import { Connection } from "./link/connection.js";
-import { decodable } from "./link/pictures.js";
+import { findDecodableCodecs } from "./link/pictures.js";
 import { ViewerLink } from "./link/viewer.js";
 import { openPage } from "./page.js";
 import { Film } from "./ui/film.js";
 import { MODES } from "./ui/modes.js";
 import { UrlState } from "./view/url_state.js";
 
-/** The server that the page came from. @returns {import("./page.js").Source} */
-function liveSource() {
+/** Use the server that the page came from. @returns {import("./page.js").Source} */
+function createLiveSource() {
   const query = new URLSearchParams(location.search);
   const token = query.get("token");
   const connection = new Connection(token, ["jpeg"]);
-  const locate = (/** @type {string} */ path, /** @type {string} */ version, /** @type {string} */ without) => {
-    const url = address(`assets/${path}`, token);
-    url.searchParams.set("v", version);
-    if (without) url.searchParams.set("without", without);
-    return url.href;
-  };
   return {
     live: true,
     modes: Object.keys(MODES),
@@ -28,24 +22,44 @@ function liveSource() {
     token,
     connection,
     link: new ViewerLink(connection),
-    assets: new Assets(locate),
+    assets: new Assets((path, version, without) => locateAsset(path, version, without, token)),
     urlState: new UrlState("search"),
     films: {
       make: (onProgress) => new Film(token, onProgress),
-      async turntable(asked) {
-        const url = address("turntable", token);
-        for (const [name, value] of Object.entries(asked)) url.searchParams.set(name, String(value));
-        const answer = await fetch(url);
-        const fitted = await answer.json();
-        if (!answer.ok) throw new Error(fitted.error);
-        return fitted;
-      },
+      turntable: (request) => fetchTurntable(request, token),
     },
     async start() {
-      connection.codecs = await decodable();
+      connection.codecs = await findDecodableCodecs();
       connection.open();
     },
   };
 }
 
-openPage(liveSource);
+/**
+ * @param {string} path
+ * @param {string} version of the assets
+ * @param {string} without names of cameras that are not used, separated by commas
+ * @param {string | null} token
+ */
+function locateAsset(path, version, without, token) {
+  const url = buildAddress(`assets/${path}`, token);
+  url.searchParams.set("v", version);
+  if (without) url.searchParams.set("without", without);
+  return url.href;
+}
+
+/**
+ * Let the server fit a turntable to the whole motion.
+ * @param {Record<string, number>} request
+ * @param {string | null} token
+ */
+async function fetchTurntable(request, token) {
+  const url = buildAddress("turntable", token);
+  for (const [name, value] of Object.entries(request)) url.searchParams.set(name, String(value));
+  const response = await fetch(url);
+  const fitted = await response.json();
+  if (!response.ok) throw new Error(fitted.error);
+  return fitted;
+}
+
+openPage(createLiveSource);

@@ -1,4 +1,5 @@
-// The page of a published performance: a folder of files on any web host. scene.json says what there is; docs/guide/publish.md.
+// The viewer of a published performance, which is a folder of files on any web host.
+// scene.json describes them; see docs/guide/publish.md.
 
 import { Assets } from "./link/assets.js";
 import { openPage } from "./page.js";
@@ -7,21 +8,26 @@ import { Recording } from "./published/recording.js";
 import { byId } from "./ui/dom.js";
 import { UrlState } from "./view/url_state.js";
 
+/** The modes that the page can draw without a server. */
 const MODES = ["rendered", "holes", "completed", "split"];
 
-/** The address of a file of the performance. @param {string} name */
-const fileAddress = (name) => new URL(`../${name}`, import.meta.url);
+/** Find the URL of a file of the performance. @param {string} name */
+const locateFile = (name) => new URL(`../${name}`, import.meta.url);
+
+/** Find the URL of a shape or of an image. @param {string} path "TIME" or "TIME/CAMERA" */
+function locateAsset(path) {
+  const [time, camera] = path.split("/");
+  return locateFile(`frames/${time}/${camera ?? "shape"}.bin`).href;
+}
 
 /** @returns {import("./page.js").Source} */
-function publishedSource() {
-  const locate = (/** @type {string} */ path) => {
-    const [time, camera] = path.split("/");
-    return fileAddress(`frames/${time}/${camera ?? "shape"}.bin`).href;
-  };
-  const recording = new Recording(() => fetch(fileAddress("scene.json")));
-  const assets = new Assets(locate, true);
+function createPublishedSource() {
+  const recording = new Recording(() => fetch(locateFile("scene.json")));
+  const assets = new Assets(locateAsset, true);
   assets.addEventListener("change", () => {
-    if (recording.scene && !assets.usable) recording.fail("Files of this performance are missing or out of reach.");
+    if (recording.scene && !assets.usable) {
+      recording.fail("Files of this performance are missing or out of reach.");
+    }
   });
   byId("picture").addEventListener("framedrawn", () => byId("poster").remove(), { once: true });
   return {
@@ -34,11 +40,11 @@ function publishedSource() {
     assets,
     urlState: new UrlState("hash"),
     films: {
-      make: (onProgress) => new CanvasFilm(locate, () => recording.scene, onProgress),
-      turntable: async (asked) => recording.frame(asked),
+      make: (onProgress) => new CanvasFilm(locateAsset, () => recording.scene, onProgress),
+      turntable: async (request) => recording.fitTurntable(request),
     },
     start: () => recording.open(),
   };
 }
 
-openPage(publishedSource);
+openPage(createPublishedSource);

@@ -1,14 +1,20 @@
-// Watching what is on air: segment by segment, or where scripts cannot do that (iPhones) by the browser's own HLS player.
-// Where both can be had ours is chosen: Chromium's player (150) asked for the playlist 47 times a second.
+// The page of spectators, which plays the broadcast: segment by segment, or with the browser's own HLS player
+// where scripts cannot play segments (iPhones). Where both work, the segment player is chosen, because
+// Chromium's HLS player (150) requested the playlist 47 times a second.
 
-import { address } from "./link/address.js";
+import { buildAddress } from "./link/address.js";
 import { SegmentPlayer } from "./link/segments.js";
 import { byId } from "./ui/dom.js";
 
+/** The media type of HLS playlists. */
 const HLS = "application/vnd.apple.mpegurl";
-/** Restart playback after it has stalled for this long. */
+/** Playback restarts after it has stalled for this long, in milliseconds. */
 const STALLED_MS = 8000;
-const AGAIN_MS = 2000;
+/** The page waits this long, in milliseconds, before it tries again. */
+const RETRY_MS = 2000;
+/** Stalls are looked for at this interval, in milliseconds. */
+const CHECK_MS = 500;
+/** Explanations of the status codes after which another try is pointless. */
 const REASONS = {
   401: "This server needs a token: open the full address that you received.",
   404: "No broadcast: the server was started without --broadcast.",
@@ -16,45 +22,63 @@ const REASONS = {
 
 const token = new URLSearchParams(location.search).get("token");
 const film = /** @type {HTMLVideoElement} */ (byId("film"));
-const playlist = address("broadcast/live.m3u8", token).href;
+const playlist = buildAddress("broadcast/live.m3u8", token).href;
 /** @type {SegmentPlayer | null} */
 let player = null;
 let playing = false;
-let [shownAt, movedAt] = [-1, 0];
+/** The position of the video at the last check, in seconds. */
+let lastPosition = -1;
+/** The time of the last check at which the video had moved, in milliseconds. */
+let lastMovedAt = 0;
 
 /** @param {string} text */
-function say(text) {
+function showMessage(text) {
   byId("said").textContent = text;
   byId("said").hidden = text === "";
 }
 
-/** Ask for the film, and again until there is one; then play it from near its end. */
+/** Request the playlist until there is one, then play from near its end. */
 async function begin() {
   playing = false;
   player?.stop();
   player = null;
-  const answer = await fetch(playlist).catch(() => null);
-  const final = /** @type {any} */ (REASONS)[answer?.status ?? 0];
-  if (final) return say(final);
-  if (!answer?.ok) {
-    say("The broadcast has not started, or the server is unreachable. Retrying.");
-    setTimeout(() => void begin(), AGAIN_MS);
+  const response = await fetch(playlist).catch(() => null);
+  const reason = /** @type {any} */ (REASONS)[response?.status ?? 0];
+  if (reason) {
+    showMessage(reason);
     return;
   }
-  if ("MediaSource" in window) player = new SegmentPlayer(film, playlist);
-  else if (film.canPlayType(HLS)) film.src = playlist;
-  else return say("This browser cannot play HLS.");
-  [playing, movedAt] = [true, performance.now()];
-  void film.play().catch(() => say("Press play."));
+  if (!response?.ok) {
+    showMessage("The broadcast has not started, or the server is unreachable. Retrying.");
+    setTimeout(() => void begin(), RETRY_MS);
+    return;
+  }
+  if ("MediaSource" in window) {
+    player = new SegmentPlayer(film, playlist);
+  } else if (film.canPlayType(HLS)) {
+    film.src = playlist;
+  } else {
+    showMessage("This browser cannot play HLS.");
+    return;
+  }
+  playing = true;
+  lastMovedAt = performance.now();
+  void film.play().catch(() => showMessage("Press play."));
 }
 
 /** Restart a stalled video unless it is paused. */
-function check() {
-  if (film.currentTime !== shownAt || film.paused) [shownAt, movedAt] = [film.currentTime, performance.now()];
-  else if (playing && performance.now() - movedAt > STALLED_MS) void begin();
+function restartIfStalled() {
+  if (film.currentTime !== lastPosition || film.paused) {
+    lastPosition = film.currentTime;
+    lastMovedAt = performance.now();
+  } else if (playing && performance.now() - lastMovedAt > STALLED_MS) {
+    void begin();
+  }
 }
 
-film.addEventListener("playing", () => say(""));
-film.addEventListener("error", () => playing && void setTimeout(() => void begin(), AGAIN_MS));
-setInterval(check, 500);
+film.addEventListener("playing", () => showMessage(""));
+film.addEventListener("error", () => {
+  if (playing) setTimeout(() => void begin(), RETRY_MS);
+});
+setInterval(restartIfStalled, CHECK_MS);
 void begin();

@@ -1,6 +1,6 @@
-// Compiling shaders.
+// Compiles shaders.
 
-/** Covers the viewport by one triangle, of three vertices without attributes. */
+/** Covers the viewport with one triangle of three vertices without attributes. */
 export const QUAD = `#version 300 es
 void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
@@ -18,8 +18,14 @@ function compile(gl, kind, source) {
 }
 
 /**
- * @param {WebGL2RenderingContext} gl @param {string} vertex @param {string} fragment @param {string[]} uniforms
- * @returns {{program: WebGLProgram, at: Record<string, WebGLUniformLocation>}} attributes are numbered in the source
+ * Compile and link a vertex and a fragment shader.
+ * @param {WebGL2RenderingContext} gl
+ * @param {string} vertex
+ * @param {string} fragment
+ * @param {string[]} uniforms
+ * @returns {{program: WebGLProgram, at: Record<string, WebGLUniformLocation>}} the program, and the locations
+ *   of
+ *   its uniforms; those of attributes stand in the source
  */
 export function buildProgram(gl, vertex, fragment, uniforms) {
   const program = /** @type {WebGLProgram} */ (gl.createProgram());
@@ -31,6 +37,8 @@ export function buildProgram(gl, vertex, fragment, uniforms) {
   }
   /** @type {any} */
   const at = {};
-  for (const name of uniforms) at[name] = gl.getUniformLocation(program, name);
+  for (const name of uniforms) {
+    at[name] = gl.getUniformLocation(program, name);
+  }
   return { program, at };
 }

@@ -1,22 +1,42 @@
-// How many canvas pixels a CSS pixel gets, and how often they are painted: less where a device cannot do it easily.
+// Adapts the resolution of the canvas, and the rate of repaints, to what the device can do.
 
-/** A sharp view at 15 repaints a second is better than a blurred one at 25. */
-const [SLOW_MS, FAST_MS] = [66, 50];
-const LEAST = 0.5;
+/**
+ * The resolution falls if repaints are farther apart than this, in milliseconds. A sharp view at 15 repaints
+ * per second is better than a blurred one at 25.
+ */
+const SLOW_MS = 66;
+/** The resolution rises if repaints are closer together than this, in milliseconds. */
+const FAST_MS = 50;
+/** The resolution never falls below this share of the display's. */
+const MIN_FACTOR = 0.5;
+/**
+ * Repaints are at least this far apart, in milliseconds, where there is no GPU, because the processor that
+ * draws also decodes the images.
+ */
+const SOFTWARE_MS = 25;
 
+/** Chooses the number of canvas pixels per CSS pixel. */
 export class Resolution {
   constructor() {
+    /** The share of the display's resolution. */
     this.factor = 1;
+    /** The mean time between refreshes, ms. */
     this.mean = 20;
+    /** Refreshes in a row. */
     this.count = 0;
   }
 
+  /** Canvas pixels per CSS pixel. */
   get ratio() {
     return Math.min(2, window.devicePixelRatio) * this.factor;
   }
 
-  /** @param {number} elapsedMs since the last refresh @param {boolean} continuous whether that one was the display's last */
-  refreshed(elapsedMs, continuous) {
+  /**
+   * Take a refresh into account.
+   * @param {number} elapsedMs since the last refresh
+   * @param {boolean} continuous whether that was the display's last refresh
+   */
+  update(elapsedMs, continuous) {
     if (!continuous) {
       this.count = 0;
       return;
@@ -25,15 +45,12 @@ export class Resolution {
     if (this.count < 3) return;
     this.mean += 0.1 * (elapsedMs - this.mean);
     if (this.count % 15) return;
-    if (this.mean > SLOW_MS) this.factor = Math.max(LEAST, this.factor * 0.8);
+    if (this.mean > SLOW_MS) this.factor = Math.max(MIN_FACTOR, this.factor * 0.8);
     else if (this.mean < FAST_MS) this.factor = Math.min(1, this.factor * 1.1);
   }
 }
 
-/** Mean time between repaints where there is no GPU: each takes the processor that pictures are decoded with, too. */
-const SOFTWARE_MS = 25;
-
-/** Skips some of the display's refreshes, so that repaints have a minimum distance in time. */
+/** Skips some of the display's refreshes, so that repaints are a minimum time apart. */
 export class RepaintLimiter {
   /** @param {boolean} software whether the processor draws */
   constructor(software) {

@@ -1,173 +1,212 @@
-// The canvas: the last frame as seen from the newest pose, and the rig on top.
+// The canvas, which shows the last frame as seen from the newest pose, with the rig on top.
 
 import { buildProgram } from "./program.js";
 import { LinePainter } from "./lines.js";
-import { pyramidDepth } from "./rig.js";
-import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
-import { Scene, filling } from "./scene.js";
-import { planeOf } from "./surface.js";
+import { computePyramidDepth } from "./rig.js";
+import { clipFromImage, clipFromPixels, clipFromWorld, isSameView } from "./projection.js";
+import { Scene, countFillers } from "./scene.js";
+import { buildPlane } from "./surface.js";
 import { length, sub } from "../view/matrix.js";
-import { eyeOfCamera } from "../view/pose.js";
+import { eyeFromExtrinsics } from "../view/pose.js";
 
 /** @typedef {import("./projection.js").Viewpoint} Viewpoint */
+/** @typedef {Viewpoint & {distance?: number}} TargetViewpoint with the distance of its target, metres */
 /** @typedef {import("./surface.js").Surface} Surface */
 /** @typedef {import("../link/frames.js").Header} Header */
 
 /**
- * @typedef {object} Shown what is known of the last frame
+ * @typedef {object} Shown a decoded frame of the server
  * @property {Header} header
  * @property {{modes: Record<string, import("../link/pictures.js").Picture>, surface: Surface | null}[]} eyes
  */
 
 /**
- * @typedef {object} DrawOptions what to draw
- * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the viewport's width
- * @property {boolean} reproject
- * @property {any} rig the cameras to show; null to show none
- * @property {import("../link/assets.js").Frame | null} [frame] drawn here, under the server's picture of the same view
+ * @typedef {object} DrawOptions
+ * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the width
+ * @property {boolean} reproject whether the server's image is reprojected to the newest pose
+ * @property {any} rig the rig to show; null for none
+ *   image of the same view; null or undefined to show the server's image only
  */
 
+/** Places each pixel of an image by its depth. */
 const VERTEX = `#version 300 es
-layout(location = 0) in vec3 place;
+layout(location = 0) in vec3 position;
 layout(location = 1) in vec2 shade;
 uniform mat4 clip;
 out vec3 pixel;
 void main() {
-  pixel = vec3(shade * place.z, place.z);
-  gl_Position = clip * vec4(place.xy * place.z, place.z, 1.0);
+  pixel = vec3(shade * position.z, position.z);
+  gl_Position = clip * vec4(position.xy * position.z, position.z, 1.0);
 }`;
+
+/** Colours a surface by an image. */
 const FRAGMENT = `#version 300 es
 precision highp float;
-uniform sampler2D picture;
+uniform sampler2D image;
 uniform vec2 size;
 uniform float tone;
-uniform vec3 ground;
+uniform vec3 background;
 uniform float opacity;
 in vec3 pixel;
 out vec4 colour;
 void main() {
-  vec3 seen = texture(picture, pixel.xy / pixel.z / size).rgb;
-  // The background is of one colour, but compression leaves traces in it.
-  vec3 off = abs(seen - ground);
+  vec3 seen = texture(image, pixel.xy / pixel.z / size).rgb;
+  // the background has one colour, but compression leaves traces in it
+  vec3 off = abs(seen - background);
   float something = smoothstep(0.015, 0.055, max(off.r, max(off.g, off.b)));
-  colour = vec4(mix(ground, seen * tone, something), opacity);
+  colour = vec4(mix(background, seen * tone, something), opacity);
 }`;
-/** Brightness of disoccluded areas, which show the colours next to them. */
+
+/** The brightness of disoccluded areas, which show the colours next to them. */
 const STRETCHED_TONE = 0.6;
-/** Time in which the server's picture appears over the drawn one. */
+/** The server's image appears over the drawn view within this time, in milliseconds. */
 const FADE_MS = 250;
-/** A view is at a camera if it is no further from it than this share of its distance. */
+/** The server's image is at least this opaque while it appears. */
+const MIN_OPACITY = 0.01;
+/** A view is at a camera if it is no farther from it than this share of its distance to the target. */
 const AT_CAMERA = 0.01;
+/**
+ * A camera's image is hidden if the view is closer to the camera than this multiple of its pyramid's depth.
+ */
+const NEAR_PYRAMID = 1.5;
+/** A vertex has this many bytes: u, v, z, s, t. */
+const VERTEX_BYTES = 20;
+/** The offset of s and t in a vertex, in bytes. */
+const SHADE_OFFSET = 12;
 
 export class Stage {
   /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     this.canvas = canvas;
-    this.software = software();
-    // Smooth outlines of drawn views, where that is cheap and pixels are large enough to see.
+    this.software = usesSoftwareRenderer();
+    // smooth the outlines of drawn views where this is cheap and pixels are large enough to see
     const antialias = !this.software && window.devicePixelRatio < 2;
     const options = { antialias, stencil: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
     this.gl = gl;
-    /** @type {Header | null} */
-    this.header = null;
-    /** @type {any[]} */
-    this.eyes = [];
-    /** Images of cameras, by mode: "original" and "error". @type {Record<string, {camera: any, picture: WebGLTexture, quad: any} | null>} */
-    this.photos = { original: null, error: null };
-    this.ground = [0, 0, 0];
+    this.background = [0, 0, 0];
     this.prepare();
   }
 
-  /** (Re)create all that lives on the GPU. */
+  /** Create everything that lives on the GPU, also after the context was lost. */
   prepare() {
+    /** The header of the server's last frame. @type {Header | null} */
     this.header = null;
+    /** Textures and meshes of the server's last frame. @type {any[]} */
     this.eyes = [];
+    /**
+     * Images of cameras by mode, "original" and "error".
+     * @type {Record<string, {camera: any, image: WebGLTexture, quad: any} | null>}
+     */
     this.photos = { original: null, error: null };
-    /** Plane of the image that is drawn. @type {any} */
-    this.quad = null;
-    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground", "opacity"]);
-    this.scene = new Scene(this.gl, filling(this.software));
-    /** When the last picture came, and the share of it that was drawn last. */
-    this.taken = { at: -Infinity, shown: 0 };
+    /** Plane of the camera image that is drawn. @type {any} */
+    this.cutOutQuad = null;
+    this.shader = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "background", "opacity"]);
+    this.scene = new Scene(this.gl, countFillers(this.software));
+    /** When the server's last image arrived, in milliseconds, and the opacity that it was last drawn with. */
+    this.lastImage = { arrivedAt: -Infinity, opacity: 0 };
     this.lines = new LinePainter(this.gl);
   }
 
-  /** Take a frame: its pictures become textures and are closed. @param {Shown} shown */
+  /** Upload a frame of the server; its images are closed. @param {Shown} shown */
   take(shown) {
     const { gl } = this;
     const { width, height } = shown.header;
     shown.eyes.forEach((eye, index) => {
-      const kept = (this.eyes[index] ??= { textures: {}, mesh: null });
-      kept.modes = Object.keys(eye.modes);
-      for (const [mode, picture] of Object.entries(eye.modes)) {
-        kept.textures[mode] ??= texture(gl);
-        gl.bindTexture(gl.TEXTURE_2D, kept.textures[mode]);
-        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-        picture.close();
+      const stored = (this.eyes[index] ??= { textures: {}, mesh: null });
+      stored.modes = Object.keys(eye.modes);
+      for (const [mode, image] of Object.entries(eye.modes)) {
+        stored.textures[mode] ??= createTexture(gl);
+        gl.bindTexture(gl.TEXTURE_2D, stored.textures[mode]);
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+        image.close();
       }
-      kept.mesh = upload(gl, kept.mesh, eye.surface);
-      kept.quad = upload(gl, kept.quad, planeOf(width, height, 1));
+      stored.mesh = uploadSurface(gl, stored.mesh, eye.surface);
+      stored.quad = uploadSurface(gl, stored.quad, buildPlane(width, height, 1));
     });
     this.eyes.length = shown.eyes.length;
     this.header = shown.header;
-    this.taken = { at: performance.now(), shown: 0 };
+    this.lastImage = { arrivedAt: performance.now(), opacity: 0 };
   }
 
-  /** Show an image in the place of the camera that took it. @param {string} mode @param {any} camera of the rig @param {TexImageSource | null} image null to show none */
-  photo(mode, camera, image) {
+  /**
+   * Set the image of a camera, which is shown at that camera.
+   * @param {string} mode "original" or "error"
+   * @param {any} camera of the rig
+   * @param {TexImageSource | null} image null to show none
+   */
+  setPhoto(mode, camera, image) {
     const { gl } = this;
-    const kept = this.photos[mode];
+    const last = this.photos[mode];
     if (!image) {
-      if (kept) gl.deleteTexture(kept.picture);
+      if (last) gl.deleteTexture(last.image);
       this.photos[mode] = null;
       return;
     }
-    const picture = kept?.picture ?? texture(gl);
-    gl.bindTexture(gl.TEXTURE_2D, picture);
+    const texture = last?.image ?? createTexture(gl);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
-    const quad = upload(gl, kept?.quad ?? null, planeOf(camera.width, camera.height, 1));
-    this.photos[mode] = { camera, picture, quad };
+    const quad = uploadSurface(gl, last?.quad ?? null, buildPlane(camera.width, camera.height, 1));
+    this.photos[mode] = { camera, image: texture, quad };
   }
 
-  /** Whether the server's picture is still appearing over the drawn one. */
+  /** Whether the server's image is still appearing over the drawn view. */
   get fading() {
-    return this.taken.shown > 0 && this.taken.shown < 1;
+    return this.lastImage.opacity > 0 && this.lastImage.opacity < 1;
   }
 
-  /** Empty the whole canvas. @param {string} ground background colour, hexadecimal RGB */
-  clear(ground) {
+  /** Clear the whole canvas. @param {string} background colour, hexadecimal RGB */
+  clear(background) {
     const { gl } = this;
-    this.ground = [0, 2, 4].map((place) => parseInt(ground.slice(place, place + 2), 16) / 255);
+    this.background = [0, 2, 4].map((start) => parseInt(background.slice(start, start + 2), 16) / 255);
     gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(this.ground[0], this.ground[1], this.ground[2], 1);
+    gl.clearColor(this.background[0], this.background[1], this.background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
-  /** Draw into a part of the current framebuffer, which it clears. @param {Viewpoint} viewer @param {number[]} viewport x, y, width, height in pixels, y up @param {DrawOptions} options @param {number} [eye] */
+  /**
+   * Clear a part of the current framebuffer and draw into it.
+   * @param {TargetViewpoint} viewer
+   * @param {number[]} viewport x, y, width, height in pixels, y up
+   * @param {DrawOptions} options
+   * @param {number} [eye] 0, or 1 for the second eye of a headset
+   */
   draw(viewer, viewport, options, eye = 0) {
+    if (options.frame) this.#drawScene(viewer, viewport, options, options.frame, eye);
+    else this.#drawImages(viewer, viewport, options, eye);
+  }
+
+  /**
+   * Draw the server's images.
+   * @param {TargetViewpoint} viewer
+   * @param {number[]} viewport
+   * @param {DrawOptions} options
+   * @param {number} eye
+   */
+  #drawImages(viewer, viewport, options, eye) {
     const { gl } = this;
     const [x, y, width, height] = viewport;
-    if (options.frame) {
-      this.#scene(viewer, viewport, options, options.frame, eye);
-      return;
-    }
     gl.viewport(x, y, width, height);
     gl.scissor(x, y, width, height);
     gl.enable(gl.SCISSOR_TEST);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
-    if (this.header && kept) {
+    const eyeImages = this.eyes[Math.min(eye, this.eyes.length - 1)];
+    if (this.header && eyeImages) {
       let start = 0;
       for (const { mode, until } of options.parts) {
-        const [from, to] = [Math.round(start * width), Math.round(until * width)];
-        gl.scissor(x + from, y, Math.max(0, to - from), height);
-        const shown = this.shownMode(viewer, mode);
-        if (shown in this.photos) this.#photo(viewer, shown);
-        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(shown) ? shown : kept.modes[0]], options, eye);
+        const left = Math.round(start * width);
+        const right = Math.round(until * width);
+        gl.scissor(x + left, y, Math.max(0, right - left), height);
+        const shown = this.resolveMode(viewer, mode);
+        if (shown in this.photos) {
+          this.#drawPhoto(viewer, shown);
+        } else {
+          const available = eyeImages.modes.includes(shown) ? shown : eyeImages.modes[0];
+          this.#drawReprojected(viewer, eyeImages, eyeImages.textures[available], options, eye);
+        }
         start = until;
       }
       gl.scissor(x, y, width, height);
@@ -175,119 +214,188 @@ export class Stage {
     if (options.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
   }
 
-  /** The frame as drawn here, and over it the server's picture of the same view. @param {Viewpoint} viewer @param {number[]} viewport @param {DrawOptions} options @param {import("../link/assets.js").Frame} frame @param {number} eye */
-  #scene(viewer, [x, y, width, height], options, frame, eye) {
-    const { gl, header } = this;
-    const place = eyeOfCamera(viewer);
-    this.scene.prepare(frame, place, options.parts.map(({ mode }) => this.shownMode(viewer, mode)));
-    const cutOuts = options.rig ? this.scene.cutOuts(frame) : [];
-    const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
-    const source = header?.cameras[Math.min(eye, header.cameras.length - 1)];
-    const same = header && kept && header.time === frame.time && samePlace(source, header.width, header.height, viewer);
-    const opacity = same ? Math.min(1, Math.max(0.01, (performance.now() - this.taken.at) / FADE_MS)) : 0;
-    this.taken.shown = opacity;
+  /**
+   * Draw a frame here, and the server's image of the same view over it.
+   * @param {TargetViewpoint} viewer
+   * @param {number[]} viewport
+   * @param {DrawOptions} options
+   * @param {import("../link/assets.js").Frame} frame
+   * @param {number} eye
+   */
+  #drawScene(viewer, viewport, options, frame, eye) {
+    const { gl } = this;
+    const [x, y, width, height] = viewport;
+    const position = eyeFromExtrinsics(viewer);
+    const modes = options.parts.map(({ mode }) => this.resolveMode(viewer, mode));
+    this.scene.prepare(frame, position, modes);
+    const cutOuts = options.rig ? this.scene.buildCutOuts(frame) : [];
+    const eyeImages = this.eyes[Math.min(eye, this.eyes.length - 1)];
+    const opacity = this.#computeOpacity(viewer, frame, eye);
+    this.lastImage.opacity = opacity;
     gl.viewport(x, y, width, height);
     gl.enable(gl.SCISSOR_TEST);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.scissor(x, y, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+
+    // draw each mode in its part of the viewport
     let start = 0;
-    for (const { mode: wanted, until } of options.parts) {
-      const mode = this.shownMode(viewer, wanted);
-      const [from, to] = [Math.round(start * width), Math.round(until * width)];
-      gl.scissor(x + from, y, Math.max(0, to - from), height);
-      const over = kept?.modes.includes(mode) ? opacity : 0;
+    options.parts.forEach(({ until }, index) => {
+      const mode = modes[index];
+      const left = Math.round(start * width);
+      const right = Math.round(until * width);
+      gl.scissor(x + left, y, Math.max(0, right - left), height);
       start = until;
       if (mode in this.photos) {
-        this.#photo(viewer, mode);
-        continue;
+        this.#drawPhoto(viewer, mode);
+        return;
       }
-      if (over < 1 || options.rig) this.scene.draw(frame, viewer, place, mode, [x, y, width, height], this.ground);
-      if (over > 0) this.#overlay(kept, kept.textures[mode], over);
-    }
+      const imageOpacity = eyeImages?.modes.includes(mode) ? opacity : 0;
+      if (imageOpacity < 1 || options.rig) {
+        this.scene.draw(frame, viewer, position, mode, viewport, this.background);
+      }
+      if (imageOpacity > 0) this.#drawOverlay(eyeImages.quad, eyeImages.textures[mode], imageOpacity);
+    });
     gl.scissor(x, y, width, height);
     if (!options.rig) return;
-    for (const { camera, picture } of cutOuts) {
-      const depth = pyramidDepth(camera, options.rig.center);
-      if (length(sub(place, camera.center)) < 1.5 * depth) continue; // it would hide the view
-      this.quad = upload(gl, this.quad, planeOf(camera.width, camera.height, depth));
-      this.#image(camera, picture, this.quad, clipFromPicture(camera, viewer));
+
+    // draw the images of the cameras, and the rig
+    for (const { camera, image } of cutOuts) {
+      const depth = computePyramidDepth(camera, options.rig.center);
+      const hidesView = length(sub(position, camera.center)) < NEAR_PYRAMID * depth;
+      if (hidesView) continue;
+      const plane = buildPlane(camera.width, camera.height, depth);
+      this.cutOutQuad = uploadSurface(gl, this.cutOutQuad, plane);
+      this.#drawQuad(camera, image, this.cutOutQuad, clipFromImage(camera, viewer));
     }
     this.lines?.draw(clipFromWorld(viewer), width, height);
   }
 
-  /** An image on a plane. @param {any} size @param {WebGLTexture} picture @param {any} quad @param {Float32Array} clip */
-  #image(size, picture, quad, clip, opacity = 1) {
+  /**
+   * Compute the opacity of the server's image over a drawn frame; 0 if the image shows another view.
+   * @param {Viewpoint} viewer
+   * @param {import("../link/assets.js").Frame} frame
+   * @param {number} eye
+   */
+  #computeOpacity(viewer, frame, eye) {
+    const { header } = this;
+    if (!header || !this.eyes.length || header.time !== frame.time) return 0;
+    const camera = header.cameras[Math.min(eye, header.cameras.length - 1)];
+    if (!isSameView(camera, header.width, header.height, viewer)) return 0;
+    return Math.min(1, Math.max(MIN_OPACITY, (performance.now() - this.lastImage.arrivedAt) / FADE_MS));
+  }
+
+  /**
+   * Draw an image on a plane.
+   * @param {{width: number, height: number}} size of the image, pixels
+   * @param {WebGLTexture} image
+   * @param {any} quad
+   * @param {Float32Array} clip clip from the image's pixels and depth
+   * @param {number} [opacity]
+   */
+  #drawQuad(size, image, quad, clip, opacity = 1) {
     const { gl } = this;
-    const { program, at } = /** @type {any} */ (this.painter);
-    gl.useProgram(program);
-    gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.uniform2f(at.size, size.width, size.height);
-    gl.uniform1f(at.tone, 1);
-    gl.uniform1f(at.opacity, opacity);
-    gl.uniform3fv(at.ground, this.ground);
+    const { at } = this.#useImage(size, image, opacity);
     gl.uniformMatrix4fv(at.clip, false, clip);
     gl.bindVertexArray(quad.array);
     gl.drawElements(gl.TRIANGLES, quad.solid, gl.UNSIGNED_INT, 0);
   }
 
-  /** What is drawn for a mode: the completed view in place of an image that does not exist at this pose. @param {Viewpoint & {distance?: number}} viewer @param {string} mode @returns {string} */
-  shownMode(viewer, mode) {
+  /**
+   * Bind an image.
+   * @param {{width: number, height: number}} size
+   * @param {WebGLTexture} image
+   * @param {number} opacity
+   */
+  #useImage(size, image, opacity) {
+    const { gl } = this;
+    const shader = /** @type {any} */ (this.shader);
+    const { program, at } = shader;
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, image);
+    gl.uniform2f(at.size, size.width, size.height);
+    gl.uniform1f(at.tone, 1);
+    gl.uniform1f(at.opacity, opacity);
+    gl.uniform3fv(at.background, this.background);
+    return shader;
+  }
+
+  /**
+   * Find the mode that is drawn: the completed view in place of an image that does not exist at this pose.
+   * @param {TargetViewpoint} viewer
+   * @param {string} mode
+   * @returns {string}
+   */
+  resolveMode(viewer, mode) {
     if (!(mode in this.photos)) return mode;
     const photo = this.photos[mode];
     if (!photo) return "completed";
-    const offset = length(sub(eyeOfCamera(viewer), photo.camera.center));
+    const offset = length(sub(eyeFromExtrinsics(viewer), photo.camera.center));
     return offset > AT_CAMERA * (viewer.distance ?? 1) ? "completed" : mode;
   }
 
-  /** A camera's image. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */
-  #photo(viewer, mode) {
+  /**
+   * Draw the image of a camera.
+   * @param {TargetViewpoint} viewer
+   * @param {string} mode
+   */
+  #drawPhoto(viewer, mode) {
     const { gl } = this;
     const photo = this.photos[mode];
     if (!photo) return;
-    const { camera, picture, quad } = photo;
+    const { camera, image, quad } = photo;
     gl.disable(gl.DEPTH_TEST);
-    this.#image(camera, picture, quad, this.#clip(camera, viewer, {}));
+    this.#drawQuad(camera, image, quad, this.#computeClip(camera, viewer, false));
     gl.enable(gl.DEPTH_TEST);
   }
 
-  /** @param {any} kept @param {WebGLTexture} picture @param {number} opacity */
-  #overlay(kept, picture, opacity) {
+  /**
+   * Blend the server's image over the drawn view.
+   * @param {any} quad
+   * @param {WebGLTexture} image
+   * @param {number} opacity
+   */
+  #drawOverlay(quad, image, opacity) {
     const { gl } = this;
     const header = /** @type {Header} */ (this.header);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
-    this.#image(header, picture, kept.quad, clipFromPixels(header.width, header.height), opacity);
+    this.#drawQuad(header, image, quad, clipFromPixels(header.width, header.height), opacity);
     gl.disable(gl.BLEND);
     gl.enable(gl.DEPTH_TEST);
   }
 
-  /** @param {Viewpoint} viewer @param {any} kept @param {WebGLTexture} picture @param {DrawOptions} options @param {number} eye */
-  #picture(viewer, kept, picture, options, eye) {
+  /**
+   * Draw the server's image, reprojected to the viewer's pose by its depth.
+   * @param {TargetViewpoint} viewer
+   * @param {any} geometry mesh and quad of the eye
+   * @param {WebGLTexture} image
+   * @param {DrawOptions} options
+   * @param {number} eye
+   */
+  #drawReprojected(viewer, geometry, image, options, eye) {
     const { gl } = this;
     const header = /** @type {Header} */ (this.header);
-    const { program, at } = /** @type {any} */ (this.painter);
     const source = header.cameras[Math.min(eye, header.cameras.length - 1)];
-    const still = !options.reproject || samePlace(source, header.width, header.height, viewer);
-    gl.useProgram(program);
-    gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.uniform2f(at.size, header.width, header.height);
-    gl.uniform1f(at.tone, 1);
-    gl.uniform1f(at.opacity, 1);
-    gl.uniform3fv(at.ground, this.ground);
+    const { at } = this.#useImage(header, image, 1);
+
+    // an image that needs no reprojection is drawn as it is; for the rig, its depth is drawn, too
+    const still = !options.reproject || isSameView(source, header.width, header.height, viewer);
     if (still) {
       gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
-      gl.bindVertexArray(kept.quad.array);
-      gl.drawElements(gl.TRIANGLES, kept.quad.solid, gl.UNSIGNED_INT, 0);
-      if (!options.rig || !kept.mesh) return;
+      gl.bindVertexArray(geometry.quad.array);
+      gl.drawElements(gl.TRIANGLES, geometry.quad.solid, gl.UNSIGNED_INT, 0);
+      if (!options.rig || !geometry.mesh) return;
       gl.colorMask(false, false, false, false);
     }
-    const mesh = kept.mesh ?? kept.quad;
-    gl.uniformMatrix4fv(at.clip, false, this.#clip(source, viewer, kept));
+
+    // draw the disoccluded areas, then the surfaces that were seen over them
+    const mesh = geometry.mesh ?? geometry.quad;
+    gl.uniformMatrix4fv(at.clip, false, this.#computeClip(source, viewer, Boolean(geometry.mesh)));
     gl.bindVertexArray(mesh.array);
-    gl.depthMask(false); // whatever was seen is drawn over it
+    gl.depthMask(false);
     gl.uniform1f(at.tone, STRETCHED_TONE);
     gl.drawElements(gl.TRIANGLES, mesh.stretched, gl.UNSIGNED_INT, 4 * mesh.solid);
     gl.depthMask(true);
@@ -296,16 +404,24 @@ export class Stage {
     gl.colorMask(true, true, true, true);
   }
 
-  /** Without depth the picture is a plane as far away as the viewer's target. @param {any} source @param {Viewpoint & {distance?: number}} viewer @param {any} kept */
-  #clip(source, viewer, kept) {
-    const clip = clipFromPicture(source, viewer);
-    if (!kept.mesh) for (let i = 0; i < 12; i++) clip[i] *= viewer.distance ?? 1;
+  /**
+   * Compute the matrix from an image to clip space. An image without depth is a plane at the viewer's target.
+   * @param {any} source camera of the image
+   * @param {TargetViewpoint} viewer
+   * @param {boolean} hasDepth
+   */
+  #computeClip(source, viewer, hasDepth) {
+    const clip = clipFromImage(source, viewer);
+    if (hasDepth) return clip;
+    for (let i = 0; i < 12; i++) {
+      clip[i] *= viewer.distance ?? 1;
+    }
     return clip;
   }
 }
 
-/** Whether the processor does what a GPU should. */
-function software() {
+/** Whether the processor draws in place of a GPU. */
+function usesSoftwareRenderer() {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl) return false;
   const info = gl.getExtension("WEBGL_debug_renderer_info");
@@ -315,33 +431,39 @@ function software() {
 }
 
 /** @param {WebGL2RenderingContext} gl */
-function texture(gl) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  for (const [name, value] of [
-    [gl.TEXTURE_MIN_FILTER, gl.LINEAR],
-    [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
-    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE],
-    [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
-  ]) {
-    gl.texParameteri(gl.TEXTURE_2D, name, value);
-  }
-  return made;
+function createTexture(gl) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+  return texture;
 }
 
-/** @param {WebGL2RenderingContext} gl @param {any} kept buffers to use again @param {Surface | null} surface */
-function upload(gl, kept, surface) {
+/**
+ * Upload a surface.
+ * @param {WebGL2RenderingContext} gl
+ * @param {any} existing buffers to use again; null to create new ones
+ * @param {Surface | null} surface
+ */
+function uploadSurface(gl, existing, surface) {
   if (!surface) return null;
-  const mesh = kept ?? { array: gl.createVertexArray(), vertices: gl.createBuffer(), indices: gl.createBuffer() };
+  const mesh = existing ?? {
+    array: gl.createVertexArray(),
+    vertices: gl.createBuffer(),
+    indices: gl.createBuffer(),
+  };
   gl.bindVertexArray(mesh.array);
   gl.bindBuffer(gl.ARRAY_BUFFER, mesh.vertices);
   gl.bufferData(gl.ARRAY_BUFFER, surface.vertices, gl.DYNAMIC_DRAW);
   gl.enableVertexAttribArray(0);
-  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 20, 0);
+  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, VERTEX_BYTES, 0);
   gl.enableVertexAttribArray(1);
-  gl.vertexAttribPointer(1, 2, gl.FLOAT, false, 20, 12);
+  gl.vertexAttribPointer(1, 2, gl.FLOAT, false, VERTEX_BYTES, SHADE_OFFSET);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.indices);
-  const [solid, stretched] = [surface.solid.length, surface.stretched.length];
+  const solid = surface.solid.length;
+  const stretched = surface.stretched.length;
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, 4 * (solid + stretched), gl.DYNAMIC_DRAW);
   gl.bufferSubData(gl.ELEMENT_ARRAY_BUFFER, 0, surface.solid);
   if (stretched) gl.bufferSubData(gl.ELEMENT_ARRAY_BUFFER, 4 * solid, surface.stretched);

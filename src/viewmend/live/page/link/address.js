@@ -1,10 +1,12 @@
-// Addresses of the server that the page came from.
+// URLs of the server that the page came from.
 
 /**
- * The address of a path of the server, which a proxy may serve under a prefix: relative to this file's own address.
- * @param {string} path @param {string | null} token
+ * Build the URL of a path of the server. A proxy may serve the page under a prefix, so the URL is relative to
+ * this file's own.
+ * @param {string} path
+ * @param {string | null} token
  */
-export function address(path, token) {
+export function buildAddress(path, token) {
   const url = new URL(`../../${path}`, import.meta.url);
   url.search = token === null ? "" : new URLSearchParams({ token }).toString();
   return url;

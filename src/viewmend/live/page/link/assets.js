@@ -1,51 +1,78 @@
-// Which frames the page can draw by itself: asks for their assets ahead of time, and keeps those used last.
+// The frames that the page can draw itself: requests their assets ahead of time, and keeps those used last.
 
 import { dot, sub, unit } from "../view/matrix.js";
 
 /** @typedef {import("./asset_worker.js").Shape} Shape */
 /** @typedef {import("./asset_worker.js").CameraImage} CameraImage */
+/** @typedef {{first: number, end: number}} Range indices of the first frame and of the one after the last */
 
 /**
  * @typedef {object} Frame
  * @property {number} time its index
  * @property {Shape | null} shape
  * @property {Map<number, CameraImage>} images by the camera's number
- * @property {Set<number | "mesh">} extended numbers of the server's completed views that are there, or that it does not have any more; "mesh" for its fused mesh
- * @property {Frame | null} refined the same frame with the mesh that the server fused from predicted depth
- * @property {number} since when it was asked for, ms
- * @property {boolean} failed
+ *   server no longer has; "mesh" for its fused mesh
+ * @property {Frame | null} fused the same frame with the mesh that the server fused from predicted depth
+ * @property {number} requestedAt ms
+ * @property {boolean} failed whether a request failed a short time ago
  */
 
-/** Frames that are kept, frames that are asked for at a time, and requests at a time. */
-const [KEPT, LOADING, REQUESTS] = [16, 3, 8];
-/** Frames beyond the next that would be in time that are asked for while playing, and the longest time that one may take. */
-const [AHEAD, MOST_MS] = [3, 2000];
-/** Failed frames in a row after which the server draws. */
-const MOST_FAILURES = 3;
+/** This many frames are kept. */
+const MAX_FRAMES = 16;
+/** This many frames are loaded at a time while playing. */
+const MAX_LOADING = 3;
+/** This many requests are sent at a time. */
+const MAX_REQUESTS = 8;
+/** While playing, this many frames beyond the next one that can be in time are requested. */
+const AHEAD = 3;
+/** As many, where the clock waits for late frames. */
+const AHEAD_WAITING = 8;
+/** A clock that waits resumes when this many frames are available. */
+const RESUME_FRAMES = 4;
+/** A frame is expected to take at most this long, in milliseconds. */
+const MAX_EXPECTED_MS = 2000;
+/** After this many failed frames in a row, the server draws. */
+const MAX_FAILURES = 3;
+/** A failed frame is requested again after this long, in milliseconds. */
+const RETRY_MS = 1000;
+/** The weight of the newest frame in the mean latency. */
+const NEWEST_WEIGHT = 0.2;
 
-/** Frames beyond the next that are asked for where the clock waits for late frames, and those that end the wait. */
-const [AHEAD_PATIENT, RESUMING] = [8, 4];
-
-/** The cosine between a camera and the eye, seen from the subject's centre. @param {any} header of a shape @param {number[]} eye @param {number} n the camera's number */
-export const nearness = ({ cameras, center }, eye, n) => dot(unit(sub(cameras[n].center, center)), unit(sub(eye, center)));
-
-/** All cameras' numbers by their angle to the eye, seen from the subject's centre. @param {Shape} shape @param {number[]} eye @returns {number[]} */
-export function rankedCameras({ header: { cameras, center } }, eye) {
-  const near = cameras.map((/** @type {any} */ _, /** @type {number} */ n) => nearness({ cameras, center }, eye, n));
-  return cameras.map((/** @type {any} */ _, /** @type {number} */ n) => n)
-    .sort((/** @type {number} */ a, /** @type {number} */ b) => near[b] - near[a] || a - b);
+/**
+ * Compute the cosine between a camera and the eye, seen from the subject's centre.
+ * @param {any} header of a shape
+ * @param {number[]} eye
+ * @param {number} n the camera's number
+ */
+export function computeAlignment({ cameras, center }, eye, n) {
+  return dot(unit(sub(cameras[n].center, center)), unit(sub(eye, center)));
 }
 
 /**
- * The cameras that colour a view: `first` the ones that the blending rule names, `fill` those that fill its holes. Completed
- * views are used like cameras that see more, except where the view is shown as rendered.
- * @param {Shape} shape @param {number[]} eye @param {string} mode @param {number} fillers cameras that fill holes
- * @param {(n: number) => boolean} [usable] whether a camera's image may be used
- * @returns {{first: number[], fill: number[]}} cameras' numbers, the closest first
+ * Sort the numbers of all cameras by their angle to the eye, seen from the subject's centre.
+ * @param {Shape} shape
+ * @param {number[]} eye
+ * @returns {number[]}
  */
-export function sourcesOf(shape, eye, mode, fillers, usable = () => true) {
+function rankCameras({ header }, eye) {
+  const numbers = [...header.cameras.keys()];
+  const alignments = numbers.map((n) => computeAlignment(header, eye, n));
+  return numbers.sort((a, b) => alignments[b] - alignments[a] || a - b);
+}
+
+/**
+ * Choose the cameras that colour a view: `first` are those of the blending rule, `fill` those that fill its
+ * holes. Completed views are used like cameras that see more, except where the view is shown as rendered.
+ * @param {Shape} shape
+ * @param {number[]} eye
+ * @param {string} mode
+ * @param {number} fillers cameras that fill holes
+ * @param {(n: number) => boolean} [usable] whether a camera's image may be used
+ * @returns {{first: number[], fill: number[]}} numbers of cameras, the closest first
+ */
+export function chooseCameras(shape, eye, mode, fillers, usable = () => true) {
   const { cameras, blend } = shape.header;
-  const ranked = rankedCameras(shape, eye).filter(usable);
+  const ranked = rankCameras(shape, eye).filter(usable);
   const real = ranked.filter((n) => !cameras[n].completed);
   if (mode === "rendered" || mode === "holes") return { first: real.slice(0, blend.cameras), fill: [] };
   const closest = ranked.slice(0, blend.completed.cameras);
@@ -55,56 +82,77 @@ export function sourcesOf(shape, eye, mode, fillers, usable = () => true) {
   return { first: real.slice(0, blend.cameras), fill: real.slice(blend.cameras, blend.cameras + fillers) };
 }
 
-/** The name of a frame without some cameras, whatever their order. @param {number} time @param {string[]} without */
-const named = (time, without) => [time, ...[...without].sort()].join(" ");
+/**
+ * Bring an index into the range from 0 to `count` - 1.
+ * @param {number} index
+ * @param {number} count
+ */
+const wrapIndex = (index, count) => ((index % count) + count) % count;
 
-/** Whether as many images are there as the blending rule needs. @param {Frame} frame */
-const complete = ({ shape, images }) => shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
+/**
+ * Name a frame without some cameras, whatever their order.
+ * @param {number} time
+ * @param {string[]} without
+ */
+const nameFrame = (time, without) => [time, ...[...without].sort()].join(" ");
 
-/** Dispatches "change" (detail: the frame) when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
+/** Whether as many images have arrived as the blending rule needs. @param {Frame} frame */
+function isComplete({ shape, images }) {
+  return shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
+}
+
+/**
+ * Dispatches "change" (detail: the frame) when an asset has arrived, and "dropped" (detail: the frame) when a
+ * frame is no longer kept.
+ */
 export class Assets extends EventTarget {
   /**
-   * @param {(path: string, version: string, without: string) => string} locate the address of a shape ("TIME") or an image ("TIME/CAMERA")
-   * @param {boolean} [patient] whether the clock waits for late frames, and files that were fetched are kept
+   * @param {(path: string, version: string, without: string) => string} locate finds the URL of a shape
+   *   ("TIME") or
+   *   of an image ("TIME/CAMERA")
+   * @param {boolean} [waitsForFrames] whether the clock waits for late frames, and fetched files are cached
    */
-  constructor(locate, patient = false) {
+  constructor(locate, waitsForFrames = false) {
     super();
     this.locate = locate;
-    this.patient = patient;
-    /** Cameras of a playing frame beyond the blending rule's. */
+    this.waitsForFrames = waitsForFrames;
+    /** Cameras beyond those of the blending rule that fill holes. */
     this.fillers = 0;
-    /** What is shown. */
+    /** The modes that are shown. */
     this.modes = ["completed"];
     /** Whether the clock waits. */
     this.buffering = false;
-    /** The version that the server's message `rig` names; null if the server draws. @type {string | null} */
+    /** The version that the message "rig" names; null if the server draws. @type {string | null} */
     this.version = null;
     /** Names of cameras that are not used, separated by commas. */
     this.without = "";
-    /** @type {Map<number, Frame>} the one used last at the end */
+    /** The frames by index; those used last are at the end. @type {Map<number, Frame>} */
     this.frames = new Map();
-    /** The frame that is shown: it is kept. @type {Frame | null} */
+    /** The frame that is shown, which is kept. @type {Frame | null} */
     this.shown = null;
-    /** @type {Set<string>} */
-    this.waiting = new Set();
-    /** What the server has made ahead, by frame: see `named`. @type {Map<string, {cameras: any[], mesh: boolean}>} */
+    /** Keys of the requests that have no answer yet. @type {Set<string>} */
+    this.pending = new Set();
+    /**
+     * Assets that the server has made ahead, by frame; see `nameFrame`.
+     * @type {Map<string, {cameras: any[], mesh: boolean}>}
+     */
     this.completed = new Map();
     this.failures = 0;
-    /** Grows when all frames are let go of: what was asked for before is of no use. */
-    this.round = 0;
+    /** Grows when all frames are dropped; answers to requests of an earlier generation are of no use. */
+    this.generation = 0;
     this.bytes = 0;
-    /** Time from asking for a frame until it can be drawn, ms. */
+    /** Mean time from the request of a frame until it can be drawn, ms. */
     this.latency = 150;
     /** @type {Worker | null} */
     this.worker = null;
   }
 
-  /** Whether the server's frames can be drawn here. */
+  /** Whether the page can draw the server's frames. */
   get usable() {
-    return this.version !== null && this.failures < MOST_FAILURES;
+    return this.version !== null && this.failures < MAX_FAILURES;
   }
 
-  /** @param {any} rig the message */
+  /** Use the assets of a rig. @param {any} rig the message */
   open(rig) {
     if (rig.assets === this.version) return;
     this.#clear();
@@ -116,15 +164,15 @@ export class Assets extends EventTarget {
     this.worker.onmessage = ({ data }) => this.#take(data);
   }
 
-  /** Frames of all cameras but some. @param {string} without names, separated by commas */
-  leaveOut(without) {
+  /** Use all cameras except some. @param {string} without names, separated by commas */
+  exclude(without) {
     if (without === this.without) return;
     this.without = without;
     this.failures = 0;
     this.#clear();
   }
 
-  /** Let go of everything. */
+  /** Drop everything. */
   close() {
     this.#clear();
     this.worker?.terminate();
@@ -134,145 +182,230 @@ export class Assets extends EventTarget {
 
   #clear() {
     this.shown = null;
-    for (const frame of this.frames.values()) this.#forget(frame);
-    this.waiting.clear();
-    this.round += 1;
+    for (const frame of this.frames.values()) this.#drop(frame);
+    this.pending.clear();
+    this.generation += 1;
   }
 
   /**
-   * The frame to draw: the one at `time`, or the last before it that is there.
-   * @param {number} time @param {number[]} eye @param {{first: number, end: number}} range @param {number} late frames that it may be behind
+   * Choose the frame to draw: the one at `time`, or the last one before it that is available.
+   * @param {number} time
+   * @param {number[]} eye
+   * @param {Range} range
+   * @param {number} maxDelay frames that the chosen one may be behind
    * @returns {Frame | null}
    */
-  choose(time, eye, { first, end }, late) {
+  choose(time, eye, { first, end }, maxDelay) {
     const count = Math.max(1, end - first);
-    for (let back = 0; back <= Math.min(late, count - 1); back++) {
-      const frame = this.frames.get(first + ((((time - back - first) % count) + count) % count));
-      if (frame && this.drawable(frame, eye)) return this.#touch(frame);
+    for (let delay = 0; delay <= Math.min(maxDelay, count - 1); delay++) {
+      const frame = this.frames.get(first + wrapIndex(time - delay - first, count));
+      if (frame && this.isDrawable(frame, eye)) {
+        this.#markUsed(frame);
+        return frame;
+      }
     }
     return null;
   }
 
-  /** Whether all that the blending rule needs is there. @param {Frame} frame @param {number[]} eye */
-  drawable(frame, eye) {
-    return frame.shape !== null && this.needed(frame, eye).every((n) => frame.images.has(n));
+  /**
+   * Whether all assets that the blending rule needs have arrived.
+   * @param {Frame} frame
+   * @param {number[]} eye
+   */
+  isDrawable(frame, eye) {
+    return frame.shape !== null && this.findNeededCameras(frame, eye).every((n) => frame.images.has(n));
   }
 
-  /** The cameras' numbers that colour what is shown. @param {Frame} frame whose shape is there @param {number[]} eye @returns {number[]} */
-  needed({ shape }, eye) {
-    const used = this.modes.map((mode) => sourcesOf(/** @type {Shape} */ (shape), eye, mode, this.fillers).first);
-    return [...new Set(used.flat())];
+  /**
+   * Find the numbers of the cameras that colour what is shown.
+   * @param {Frame} frame whose shape has arrived
+   * @param {number[]} eye
+   * @returns {number[]}
+   */
+  findNeededCameras({ shape }, eye) {
+    const numbers = this.modes.map((mode) => {
+      return chooseCameras(/** @type {Shape} */ (shape), eye, mode, this.fillers).first;
+    });
+    return [...new Set(numbers.flat())];
   }
 
-  /** Whether playback has to wait at a frame: once it does, until some of the next ones are there, too. @param {number} time @param {number[]} eye @param {{first: number, end: number}} range */
-  buffers(time, eye, { first, end }) {
+  /**
+   * Decide whether playback waits at a frame. Once it does, it waits until some of the next frames are
+   * available.
+   * @param {number} time
+   * @param {number[]} eye
+   * @param {Range} range
+   */
+  updateBuffering(time, eye, { first, end }) {
     const count = Math.max(1, end - first);
-    const ahead = this.buffering ? Math.min(count, RESUMING) : 1;
-    const frames = Array.from({ length: ahead }, (_, step) => this.frames.get(first + ((time - first + step) % count)));
-    this.buffering = !frames.every((frame) => frame && this.drawable(frame, eye));
+    const ahead = this.buffering ? Math.min(count, RESUME_FRAMES) : 1;
+    const frames = Array.from({ length: ahead }, (_, step) => {
+      return this.frames.get(first + ((time - first + step) % count));
+    });
+    this.buffering = !frames.every((frame) => frame && this.isDrawable(frame, eye));
     return this.buffering;
   }
 
   /**
-   * Ask for what is missing: first for the rest of frames that were begun and are still of use, then for the next ones.
-   * @param {number} time @param {number[]} eye @param {{first: number, end: number}} range
-   * @param {{playing: boolean, framesPerMs: number, live: boolean}} clock a live rig's next frames cannot be asked for
+   * Request missing assets: first the rest of frames that are partly loaded and still of use, then the next
+   * ones.
+   * @param {number} time
+   * @param {number[]} eye
+   * @param {Range} range
+   * @param {{playing: boolean, framesPerMs: number, live: boolean}} clock the next frames of a live rig
+   *   cannot be
+   *   requested
    */
-  want(time, eye, { first, end }, { playing, framesPerMs, live }) {
+  request(time, eye, { first, end }, { playing, framesPerMs, live }) {
     const count = Math.max(1, end - first);
-    const late = playing && !this.patient ? Math.ceil(framesPerMs * this.#expected()) : 0;
-    const ahead = playing && !live && !this.#begins ? Math.min(count - 1, (this.patient ? AHEAD_PATIENT : AHEAD) + late) : 0;
-    const steps = (/** @type {Frame} */ frame) => (((frame.time - time) % count) + count) % count;
+    const playsAhead = playing && !live;
+    // frames that would arrive too late
+    const late = playing && !this.waitsForFrames ? Math.ceil(framesPerMs * this.#expectLatency()) : 0;
+    const maxAhead = (this.waitsForFrames ? AHEAD_WAITING : AHEAD) + late;
+    const ahead = playsAhead && !this.#loadsFirstFrame ? Math.min(count - 1, maxAhead) : 0;
+
+    // complete the frames that are partly loaded
     let loading = 0;
     for (const frame of this.frames.values()) {
-      const useful = steps(frame) <= ahead || (playing && count - steps(frame) <= AHEAD + 2 * late);
+      const steps = wrapIndex(frame.time - time, count);
+      const useful = steps <= ahead || (playing && count - steps <= AHEAD + 2 * late);
       if (useful && !frame.failed && !this.#load(frame, eye, playing)) loading += 1;
-      else if (!useful && !complete(frame)) this.#forget(frame);
+      else if (!useful && !isComplete(frame)) this.#drop(frame);
     }
-    for (let step = 0; step <= ahead && loading < (playing && !live ? LOADING : 1); step++) {
+
+    // begin the next ones
+    const maxLoading = playsAhead ? MAX_LOADING : 1;
+    for (let step = 0; step <= ahead && loading < maxLoading; step++) {
       const index = first + ((time - first + step) % count);
-      if (this.frames.has(index) || (ahead && step < late && loading > 0)) continue; // known, or it would come too late
+      const tooLate = ahead && step < late && loading > 0;
+      if (this.frames.has(index) || tooLate) continue;
       this.#load(this.#add(index), eye, playing);
       loading += 1;
     }
   }
 
-  /** Whether nothing was shown yet, and the clock waits: the first picture shares the line with nothing else. */
-  get #begins() {
-    return this.patient && this.shown === null;
+  /** Whether nothing was shown yet and the clock waits: the first frame is loaded alone. */
+  get #loadsFirstFrame() {
+    return this.waitsForFrames && this.shown === null;
   }
 
-  /** How long the next frame will probably take, ms. */
-  #expected() {
+  /** Estimate how long the next frame will take, in milliseconds. */
+  #expectLatency() {
     const now = performance.now();
     let longest = this.latency;
-    for (const frame of this.frames.values()) if (!complete(frame)) longest = Math.max(longest, now - frame.since);
-    return Math.min(MOST_MS, longest);
+    for (const frame of this.frames.values()) {
+      if (!isComplete(frame)) longest = Math.max(longest, now - frame.requestedAt);
+    }
+    return Math.min(MAX_EXPECTED_MS, longest);
   }
 
-  /** Ask for a frame's missing parts. @param {Frame} frame @param {number[]} eye @param {boolean} playing @returns {boolean} whether all is there */
+  /**
+   * Request the missing assets of a frame.
+   * @param {Frame} frame
+   * @param {number[]} eye
+   * @param {boolean} playing
+   * @returns {boolean} whether none is missing
+   */
   #load(frame, eye, playing) {
     const { shape, images, time } = frame;
     if (!shape) {
-      this.#ask(`${time}`, null);
+      this.#requestAsset(`${time}`, null);
       return false;
     }
-    const played = this.modes.map((mode) => sourcesOf(shape, eye, mode, this.fillers));
-    const wanted = playing ? played.flatMap(({ first, fill }) => [...first, ...fill]) : rankedCameras(shape, eye);
-    const drawsFirst = (!playing || this.#begins) && !this.drawable(frame, eye);
-    const missing = [...new Set(drawsFirst ? this.needed(frame, eye) : wanted)].filter((n) => !images.has(n));
-    for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
-    if (missing.length === 0) this.#extend(frame, eye);
+    const drawsFirst = (!playing || this.#loadsFirstFrame) && !this.isDrawable(frame, eye);
+    const wanted = drawsFirst
+      ? this.findNeededCameras(frame, eye)
+      : this.#listWantedCameras(shape, eye, playing);
+    const missing = [...new Set(wanted)].filter((n) => !images.has(n));
+    for (const n of missing) this.#requestAsset(`${time}/${n}`, shape.header.cameras[n]);
+    if (missing.length === 0) this.#loadExtra(frame, eye);
     return missing.length === 0;
   }
 
-  /** Completed views and the mesh of a frame that the server has made. @param {{time: number, without: string[], cameras: any[], mesh: boolean}} message */
-  offer({ time, without, cameras, mesh }) {
-    this.completed.set(named(time, without), { cameras, mesh });
+  /**
+   * List the cameras that colour what is shown or fill its holes while playing, or all cameras at rest.
+   * @param {Shape} shape
+   * @param {number[]} eye
+   * @param {boolean} playing
+   */
+  #listWantedCameras(shape, eye, playing) {
+    if (!playing) return rankCameras(shape, eye);
+    return this.modes.flatMap((mode) => {
+      const { first, fill } = chooseCameras(shape, eye, mode, this.fillers);
+      return [...first, ...fill];
+    });
+  }
+
+  /**
+   * Take the message that the server has completed views, or the mesh, of a frame.
+   * @param {{time: number, without: string[], cameras: any[], mesh: boolean}} message
+   */
+  addCompleted({ time, without, cameras, mesh }) {
+    this.completed.set(nameFrame(time, without), { cameras, mesh });
     this.dispatchEvent(new CustomEvent("change", { detail: undefined }));
   }
 
-  /** What is offered of a frame. @param {Frame} frame */
-  #offers({ time }) {
-    return this.completed.get(named(time, this.without.split(",").filter(Boolean))) ?? { cameras: [], mesh: false };
+  /** Find what the server has completed of a frame. @param {Frame} frame */
+  #findCompleted({ time }) {
+    const name = nameFrame(time, this.without.split(",").filter(Boolean));
+    return this.completed.get(name) ?? { cameras: [], mesh: false };
   }
 
-  /** Ask for the fused mesh, then for the completed view that is closest to the eye, of those that are missing, once all else is there. @param {Frame} frame @param {number[]} eye */
-  #extend(frame, eye) {
-    if (this.waiting.size) return;
-    const { cameras, mesh } = this.#offers(frame);
-    if (mesh && !frame.extended.has("mesh")) {
-      this.#ask(`${frame.time}/mesh`, null);
+  /**
+   * Request the fused mesh or, after it, the completed view that is closest to the eye, once all else has
+   * arrived.
+   * @param {Frame} frame
+   * @param {number[]} eye
+   */
+  #loadExtra(frame, eye) {
+    if (this.pending.size) return;
+    const { cameras, mesh } = this.#findCompleted(frame);
+    if (mesh && !frame.extras.has("mesh")) {
+      this.#requestAsset(`${frame.time}/mesh`, null);
       return;
     }
-    const missing = cameras.filter(({ number }) => !frame.extended.has(number));
+    const missing = cameras.filter(({ number }) => !frame.extras.has(number));
     if (!missing.length) return;
     const { center } = /** @type {Shape} */ (frame.shape).header;
-    const near = missing.map((_, n) => nearness({ cameras: missing, center }, eye, n));
-    const closest = missing[near.indexOf(Math.max(...near))];
-    this.#ask(`${frame.time}/${closest.number}`, closest);
+    const alignments = missing.map((_, n) => computeAlignment({ cameras: missing, center }, eye, n));
+    const closest = missing[alignments.indexOf(Math.max(...alignments))];
+    this.#requestAsset(`${frame.time}/${closest.number}`, closest);
   }
 
   /** @param {string} path @param {any} camera */
-  #ask(path, camera) {
-    const key = `${this.round} ${path}`;
-    if (this.waiting.has(key) || this.waiting.size >= REQUESTS) return;
-    this.waiting.add(key);
+  #requestAsset(path, camera) {
+    const key = `${this.generation} ${path}`;
+    if (this.pending.has(key) || this.pending.size >= MAX_REQUESTS) return;
+    this.pending.add(key);
     const url = this.locate(path, this.version ?? "", this.without);
-    this.worker?.postMessage({ key, url, camera, keeps: this.patient });
+    this.worker?.postMessage({ key, url, camera, keep: this.waitsForFrames });
   }
 
-  /** @param {number} time @returns {Frame} */
+  /**
+   * Add a frame, and drop the ones used least recently.
+   * @param {number} time
+   * @returns {Frame}
+   */
   #add(time) {
     /** @type {Frame} */
-    const frame = { time, shape: null, images: new Map(), extended: new Set(), refined: null, since: performance.now(), failed: false };
+    const frame = {
+      time,
+      shape: null,
+      images: new Map(),
+      extras: new Set(),
+      fused: null,
+      requestedAt: performance.now(),
+      failed: false,
+    };
     this.frames.set(time, frame);
-    for (const old of this.frames.values()) if (this.frames.size > KEPT) this.#forget(old);
+    for (const oldest of this.frames.values()) {
+      if (this.frames.size > MAX_FRAMES) this.#drop(oldest);
+    }
     return frame;
   }
 
-  /** @param {Frame} frame */
-  #forget(frame) {
+  /** Drop a frame unless it is shown. @param {Frame} frame */
+  #drop(frame) {
     if (frame === this.shown) return;
     this.frames.delete(frame.time);
     this.dispatchEvent(new CustomEvent("dropped", { detail: frame }));
@@ -280,54 +413,76 @@ export class Assets extends EventTarget {
     frame.images.clear();
   }
 
-  /** @param {Frame} frame */
-  #touch(frame) {
+  /** Move a frame to the end, where those used last are. @param {Frame} frame */
+  #markUsed(frame) {
     this.frames.delete(frame.time);
     this.frames.set(frame.time, frame);
-    return frame;
   }
 
-  /** @param {import("./asset_worker.js").News} news */
-  #take({ key, shape, image, bytes, failed }) {
-    this.waiting.delete(key);
-    const [round, path] = key.split(" ");
+  /** Take an answer of the worker. @param {import("./asset_worker.js").Result} result */
+  #take(result) {
+    const { key, shape, image, bytes } = result;
+    this.pending.delete(key);
+    const [generation, path] = key.split(" ");
     const [time, part] = path.split("/");
-    const camera = Number(part);
-    const frame = Number(round) === this.round ? this.frames.get(Number(time)) : undefined;
-    const offered = frame && this.#offers(frame).cameras.find(({ number }) => number === camera);
-    if (!frame) image?.picture.close();
-    else if (part === "mesh") this.#refine(frame, shape);
-    else if (offered) {
-      frame.extended.add(camera);
-      if (image) frame.images.set(/** @type {Shape} */ (frame.shape).header.cameras.push(offered) - 1, image);
-    } else if (shape) frame.shape = shape;
-    else if (image) frame.images.set(camera, image);
-    else if (failed !== undefined) this.#fail(frame);
+    const frame = Number(generation) === this.generation ? this.frames.get(Number(time)) : undefined;
+    if (frame) this.#store(frame, part, result);
+    else image?.picture.close();
     if (frame && !frame.failed) {
       this.failures = shape ? 0 : this.failures;
       this.bytes += bytes ?? 0;
       if (image && frame.images.size === frame.shape?.header.blend.cameras) {
-        this.latency += 0.2 * (performance.now() - frame.since - this.latency);
+        this.latency += NEWEST_WEIGHT * (performance.now() - frame.requestedAt - this.latency);
       }
     }
     this.dispatchEvent(new CustomEvent("change", { detail: frame }));
   }
 
-  /** Keep a frame's fused mesh, which is drawn where completed views are shown. @param {Frame} frame @param {Shape | undefined} mesh undefined if the server does not have it any more */
-  #refine(frame, mesh) {
-    frame.extended.add("mesh");
-    if (!mesh || !frame.shape) return;
-    const header = { ...frame.shape.header, ...mesh.header };
-    frame.refined = { ...frame, shape: { ...mesh, header } };
+  /**
+   * Store an asset in its frame.
+   * @param {Frame} frame
+   * @param {string | undefined} part the camera's number, "mesh", or undefined for the shape
+   * @param {import("./asset_worker.js").Result} result
+   */
+  #store(frame, part, { shape, image, failed }) {
+    const number = Number(part);
+    const completed = this.#findCompleted(frame).cameras.find((camera) => camera.number === number);
+    if (part === "mesh") {
+      this.#storeMesh(frame, shape);
+    } else if (completed) {
+      frame.extras.add(number);
+      if (!image) return;
+      const { cameras } = /** @type {Shape} */ (frame.shape).header;
+      cameras.push(completed);
+      frame.images.set(cameras.length - 1, image);
+    } else if (shape) {
+      frame.shape = shape;
+    } else if (image) {
+      frame.images.set(number, image);
+    } else if (failed !== undefined) {
+      this.#fail(frame);
+    }
   }
 
-  /** It is tried again when it is wanted the next time round. @param {Frame} frame */
+  /**
+   * Store the fused mesh of a frame, which is drawn where completed views are shown.
+   * @param {Frame} frame
+   * @param {Shape | undefined} mesh undefined if the server no longer has it
+   */
+  #storeMesh(frame, mesh) {
+    frame.extras.add("mesh");
+    if (!mesh || !frame.shape) return;
+    const header = { ...frame.shape.header, ...mesh.header };
+    frame.fused = { ...frame, shape: { ...mesh, header } };
+  }
+
+  /** Try a frame again later, when it is next requested. @param {Frame} frame */
   #fail(frame) {
     frame.failed = true;
     this.failures += 1;
     setTimeout(() => {
       if (this.frames.get(frame.time) === frame && !frame.shape) this.frames.delete(frame.time);
       frame.failed = false;
-    }, 1000);
+    }, RETRY_MS);
   }
 }

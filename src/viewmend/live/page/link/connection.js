@@ -1,23 +1,40 @@
-// The link to the server: hello, messages as events, and a new try when it breaks.
+// The connection to the server: messages become events, and a broken connection is restored.
 
-import { address } from "./address.js";
+import { buildAddress } from "./address.js";
 
+/** The version of the protocol. */
 const VERSION = 1;
-const LONGEST_WAIT_MS = 15000;
-/** Close codes after which another try is pointless. */
-const FINAL = {
-  4401: "This server needs a token. Open the full address, with its token, that the server printed when it started.",
+/** The first wait before another try, in milliseconds; each further wait is twice as long. */
+const MIN_RETRY_MS = 500;
+/** The longest wait before another try, in milliseconds. */
+const MAX_RETRY_MS = 15000;
+/** A hidden page closes its connection after this long, in milliseconds. */
+const HIDDEN_MS = 10000;
+/** WebSocket's close code of a connection that broke or was never established. */
+const ABNORMAL_CLOSURE = 1006;
+/** The server's close code for a missing or wrong token. */
+const UNAUTHORISED = 4401;
+/** Explanations of the close codes after which another try is pointless. */
+const FINAL_REASONS = {
+  4401:
+    "This server needs a token. " +
+    "Open the full address, with its token, that the server printed when it started.",
   4426: "The page and the server have different versions. Reload the page.",
 };
-const REASONS = { 4429: "This page sent too many messages; the server closed the connection.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
+/** Explanations of other close codes. */
+const REASONS = {
+  1012: "The server has stopped.",
+  4429: "This page sent too many messages; the server closed the connection.",
+  4503: "The maximum number of viewers is reached.",
+};
 
 /**
- * Events: "message" (detail: a JSON message), "picture" (detail: a frame, decoded), "trouble" (detail: text, of one that cannot
- * be), and "status" (detail: {status, text, wait_s}) where status is "connecting", "open", "lost" (another try in wait_s) or
- * "refused". The socket is a worker's.
+ * Owns the socket, which lives in a worker. Events: "message" (detail: a JSON message), "picture" (detail: a
+ * decoded frame), "undecodable" (detail: the error of a frame that cannot be decoded), and "status" (detail:
+ * {status, text, wait_s}), where status is "connecting", "open", "lost" (another try in wait_s) or "refused".
  */
 export class Connection extends EventTarget {
-  /** @param {string | null} token @param {string[]} codecs */
+  /** @param {string | null} token @param {string[]} codecs that the browser can decode */
   constructor(token, codecs) {
     super();
     this.token = token;
@@ -28,41 +45,45 @@ export class Connection extends EventTarget {
     this.timer = 0;
     this.refused = false;
     this.worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
-    this.worker.onmessage = ({ data }) => this.#hear(data);
-    document.addEventListener("visibilitychange", () => this.#visibility());
+    this.worker.onmessage = ({ data }) => this.#handle(data);
+    document.addEventListener("visibilitychange", () => this.#followVisibility());
   }
 
+  /** Connect, unless there is a connection. */
   open() {
     clearTimeout(this.timer);
     if (this.socket !== "none") return;
-    this.#status("connecting", "Connecting");
-    const url = address("ws", this.token);
+    this.#reportStatus("connecting", "Connecting");
+    const url = buildAddress("ws", this.token);
     url.protocol = url.protocol.replace("http", "ws");
     this.socket = "opening";
-    this.#order({ open: url.href });
+    this.#command({ open: url.href });
   }
 
-  /** @param {object} message @returns {boolean} whether it went out */
+  /** @param {object} message @returns {boolean} whether it was sent */
   send(message) {
     if (this.socket !== "open") return false;
-    this.#order({ send: JSON.stringify(message) });
+    this.#command({ send: JSON.stringify(message) });
     return true;
   }
 
-  /** @param {import("./worker.js").Order} order */
-  #order(order) {
-    this.worker.postMessage(order);
+  /** @param {import("./worker.js").Command} command */
+  #command(command) {
+    this.worker.postMessage(command);
   }
 
-  /** @param {any} news message of the worker */
-  #hear(news) {
-    if ("picture" in news) {
-      this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
-      this.#order({ taken: true });
-    } else if ("text" in news) this.#receive(JSON.parse(news.text));
-    else if ("trouble" in news) this.dispatchEvent(new CustomEvent("trouble", { detail: news.trouble }));
-    else if ("closed" in news) void this.#ended(news.closed.code, news.closed.reason);
-    else {
+  /** Handle a report of the worker. @param {any} report */
+  #handle(report) {
+    if ("picture" in report) {
+      this.dispatchEvent(new CustomEvent("picture", { detail: report.picture }));
+      this.#command({ taken: true });
+    } else if ("text" in report) {
+      this.#receive(JSON.parse(report.text));
+    } else if ("undecodable" in report) {
+      this.dispatchEvent(new CustomEvent("undecodable", { detail: report.undecodable }));
+    } else if ("closed" in report) {
+      void this.#findReason(report.closed.code, report.closed.reason);
+    } else {
       this.socket = "open";
       this.send({ type: "hello", version: VERSION, codecs: this.codecs });
     }
@@ -72,43 +93,58 @@ export class Connection extends EventTarget {
   #receive(message) {
     if (message.type === "welcome") {
       this.failures = 0;
-      this.#status("open", "Connected");
+      this.#reportStatus("open", "Connected");
     }
     this.dispatchEvent(new CustomEvent("message", { detail: message }));
   }
 
-  /** A refused handshake says nothing to a page: whether it is the token, /health says. @param {number} code @param {string} reason */
-  async #ended(code, reason) {
-    if (code !== 1006 || this.socket !== "opening") return this.#closed(code, reason);
-    const health = await fetch(address("health", this.token)).catch(() => null);
-    return this.#closed(health?.status === 401 ? 4401 : code, reason);
+  /**
+   * Find out why the connection was closed. A browser does not say why a handshake was refused, but /health
+   * does.
+   * @param {number} code
+   * @param {string} reason
+   */
+  async #findReason(code, reason) {
+    if (code !== ABNORMAL_CLOSURE || this.socket !== "opening") {
+      this.#close(code, reason);
+      return;
+    }
+    const health = await fetch(buildAddress("health", this.token)).catch(() => null);
+    this.#close(health?.status === 401 ? UNAUTHORISED : code, reason);
   }
 
-  /** @param {number} code @param {string} reason */
-  #closed(code, reason) {
+  /**
+   * Report that the connection was closed, and try again if that makes sense.
+   * @param {number} code
+   * @param {string} reason
+   */
+  #close(code, reason) {
     this.socket = "none";
-    const final = /** @type {any} */ (FINAL)[code];
-    if (final) {
+    const finalReason = /** @type {any} */ (FINAL_REASONS)[code];
+    if (finalReason) {
       this.refused = true;
-      this.#status("refused", final);
+      this.#reportStatus("refused", finalReason);
       return;
     }
     this.failures += 1;
-    const wait = Math.min(LONGEST_WAIT_MS, 500 * 2 ** (this.failures - 1));
-    const why = /** @type {any} */ (REASONS)[code] ?? (reason || "Connection lost.");
-    this.#status("lost", why, wait / 1000);
+    const wait = Math.min(MAX_RETRY_MS, MIN_RETRY_MS * 2 ** (this.failures - 1));
+    const text = /** @type {any} */ (REASONS)[code] ?? (reason || "Connection lost.");
+    this.#reportStatus("lost", text, wait / 1000);
     if (!document.hidden) this.timer = setTimeout(() => this.open(), wait);
   }
 
-  /** A hidden page costs the server nothing; it comes back when it is looked at. */
-  #visibility() {
+  /** Disconnect while the page is hidden, so that it costs the server nothing. */
+  #followVisibility() {
     clearTimeout(this.timer);
-    if (document.hidden) this.timer = setTimeout(() => this.#order({ close: "hidden" }), 10000);
-    else if (!this.refused) this.open();
+    if (document.hidden) {
+      this.timer = setTimeout(() => this.#command({ close: "hidden" }), HIDDEN_MS);
+    } else if (!this.refused) {
+      this.open();
+    }
   }
 
   /** @param {string} status @param {string} text @param {number} [wait_s] */
-  #status(status, text, wait_s = 0) {
+  #reportStatus(status, text, wait_s = 0) {
     this.dispatchEvent(new CustomEvent("status", { detail: { status, text, wait_s } }));
   }
 }

@@ -1,7 +1,7 @@
-// A binary message: "VMF1", the length of a header, the header in JSON, and the parts that it lists.
+// Parses binary messages: "VMF1", the length of the header, the header in JSON, and the parts that it lists.
 
 /**
- * @typedef {object} Header docs/live-protocol.md says what each field means
+ * @typedef {object} Header docs/live-protocol.md explains the fields
  * @property {number} frame
  * @property {number} look
  * @property {number} sent_ms
@@ -19,15 +19,20 @@
  * @property {any[]} parts
  */
 
-/** @typedef {{about: any, bytes: Uint8Array}} Part */
+/** The bytes of a message's mark, and of the length after it. */
+const PREFIX_BYTES = 8;
+/** The largest quantised inverse depth; 0 stands for no surface. */
+const DEPTH_STEPS = 65534;
+
+/** @typedef {{about: any, bytes: Uint8Array}} Part `about`: its entry in the header */
 
 /** @param {ArrayBuffer} message @returns {{header: Header, parts: Part[], bytes: number}} */
 export function parseFrame(message) {
   const mark = new TextDecoder().decode(new Uint8Array(message, 0, Math.min(4, message.byteLength)));
   if (mark !== "VMF1") throw new Error(`expected a frame that begins with VMF1, got ${JSON.stringify(mark)}`);
   const length = new DataView(message).getUint32(4, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 8, length)));
-  let offset = 8 + length;
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, PREFIX_BYTES, length)));
+  let offset = PREFIX_BYTES + length;
   const parts = header.parts.map((/** @type {any} */ about) => {
     const bytes = new Uint8Array(message, offset, about.bytes);
     offset += about.bytes;
@@ -40,18 +45,25 @@ export function parseFrame(message) {
  * @typedef {object} Depth
  * @property {number} width
  * @property {number} height
- * @property {number} stride image pixels a depth pixel
+ * @property {number} stride image pixels per depth pixel
  * @property {Float32Array} z metres, 0 where there is no surface
  */
 
-/** @param {Part} part @returns {Promise<Depth>} */
+/**
+ * Decode a depth map. It is stored as differences along each row of the quantised inverse depth.
+ * @param {Part} part
+ * @returns {Promise<Depth>}
+ */
 export async function decodeDepth({ about, bytes }) {
-  const stream = new Blob([/** @type {any} */ (bytes)]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const blob = new Blob([/** @type {any} */ (bytes)]);
+  const stream = blob.stream().pipeThrough(new DecompressionStream("deflate"));
   const deltas = new DataView(await new Response(stream).arrayBuffer());
   const { width, height, stride, near_m: near, far_m: far } = about;
   const z = new Float32Array(width * height);
-  const [start, step] = [1 / far, (1 / near - 1 / far) / 65534];
-  for (let row = 0, index = 0; row < height; row++) {
+  const start = 1 / far;
+  const step = (1 / near - 1 / far) / DEPTH_STEPS;
+  let index = 0;
+  for (let row = 0; row < height; row++) {
     let q = 0;
     for (let column = 0; column < width; column++, index++) {
       q = (q + deltas.getUint16(2 * index, true)) & 0xffff;

@@ -1,19 +1,20 @@
-// Bytes of a JPEG or of a video stream to something that WebGL takes as a texture.
+// Decodes JPEGs and video streams to images that WebGL accepts as textures.
 
-/** @typedef {ImageBitmap | VideoFrame} Picture close() it when it was drawn */
+/** @typedef {ImageBitmap | VideoFrame} Picture call `close()` after it was uploaded */
 
+/** The video codecs of the server, and the strings that browsers know them by. */
 const CANDIDATES = { vp9: "vp09.00.10.08", h264: "avc1.42E01E" };
 
-/** What this browser can decode, the server's names. @returns {Promise<string[]>} */
-export async function decodable() {
+/** Find the codecs that this browser can decode, by the server's names. @returns {Promise<string[]>} */
+export async function findDecodableCodecs() {
   const codecs = ["jpeg"];
   if (typeof VideoDecoder === "undefined") return codecs;
   for (const [name, codec] of Object.entries(CANDIDATES)) {
     try {
-      const answer = await VideoDecoder.isConfigSupported({ codec, codedWidth: 320, codedHeight: 320 });
-      if (answer.supported) codecs.push(name);
+      const support = await VideoDecoder.isConfigSupported({ codec, codedWidth: 320, codedHeight: 320 });
+      if (support.supported) codecs.push(name);
     } catch {
-      // a browser that does not know the name
+      // the browser does not know the codec
     }
   }
   return codecs;
@@ -25,16 +26,19 @@ export function decodeJpeg(bytes) {
   return createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
 }
 
-/** One stream of one eye and mode: pictures come out under the number that they were put in with. */
+/** Decodes the stream of one eye and mode. */
 class VideoStream {
   constructor() {
-    /** @type {Map<number, {resolve: (frame: VideoFrame) => void, reject: (error: Error) => void}>} */
+    /**
+     * The frames that are being decoded, by number.
+     * @type {Map<number, {resolve: (frame: VideoFrame) => void, reject: (error: Error) => void}>}
+     */
     this.waiting = new Map();
     this.config = "";
-    this.decoder = this.#decoder();
+    this.decoder = this.#createDecoder();
   }
 
-  #decoder() {
+  #createDecoder() {
     return new VideoDecoder({
       output: (frame) => {
         const waiter = this.waiting.get(frame.timestamp);
@@ -46,7 +50,7 @@ class VideoStream {
     });
   }
 
-  /** @param {Error} error */
+  /** Reject all frames that are being decoded. @param {Error} error */
   #fail(error) {
     for (const { reject } of this.waiting.values()) reject(error);
     this.waiting.clear();
@@ -55,7 +59,7 @@ class VideoStream {
   /** @param {any} about @param {Uint8Array} bytes @param {number} number @returns {Promise<VideoFrame>} */
   decode(about, bytes, number) {
     if (about.key && (about.codec_string !== this.config || this.decoder.state !== "configured")) {
-      if (this.decoder.state === "closed") this.decoder = this.#decoder();
+      if (this.decoder.state === "closed") this.decoder = this.#createDecoder();
       this.decoder.configure({ codec: about.codec_string, optimizeForLatency: true });
       this.config = about.codec_string;
     }
@@ -76,14 +80,18 @@ class VideoStream {
   }
 }
 
-/** Decodes the pictures of all eyes and modes of one connection. */
+/** Decodes the images of all eyes and modes of one connection. */
 export class PictureDecoder {
   constructor() {
     /** @type {Map<string, VideoStream>} */
     this.streams = new Map();
   }
 
-  /** @param {import("./frames.js").Part} part @param {number} number of the frame @returns {Promise<Picture>} */
+  /**
+   * @param {import("./frames.js").Part} part
+   * @param {number} number of the frame
+   * @returns {Promise<Picture>}
+   */
   decode({ about, bytes }, number) {
     if (about.codec === "jpeg") return decodeJpeg(bytes);
     const key = `${about.codec} ${about.eye} ${about.mode}`;

@@ -1,22 +1,31 @@
-// The protocol between page and server, without display.
+// The protocol between page and server, without the display.
+
+/** Requests are at least this far apart, in milliseconds. */
+const MIN_INTERVAL_MS = 16;
+/** Requests use at most this share of the messages that the server accepts. */
+const MESSAGE_SHARE = 0.5;
 
 /**
- * Events, with the message as detail: "welcome", "rig", "state", "stats", "error"; "picture" (detail: worker.js's Picture) in
- * the order of the frames; "trouble" (detail: text) when a picture could not be decoded.
+ * Sends requests and receives messages. Events, with the message as detail: "welcome", "rig", "state",
+ * "stats", "error"; "picture" (detail: worker.js's Picture) in the order of the frames; "undecodable"
+ * (detail: the error) if a frame could not be decoded.
  */
 export class ViewerLink extends EventTarget {
   /** @param {import("./connection.js").Connection} connection */
   constructor(connection) {
     super();
     this.connection = connection;
-    this.looks = 0;
-    this.lastLook = "";
-    this.lastSent = -Infinity;
-    this.leastGapMs = 16;
-    /** Whether the view that `look` was last called with still has to be asked for. */
-    this.late = false;
-    connection.addEventListener("message", (event) => this.#hear(/** @type {CustomEvent} */ (event).detail));
-    for (const name of ["picture", "trouble"]) {
+    this.requestCount = 0;
+    /** The last request as JSON; "" for none. */
+    this.lastRequest = "";
+    this.lastSentAt = -Infinity;
+    this.minIntervalMs = MIN_INTERVAL_MS;
+    /** Whether the view that was last passed to `requestView` has not been requested yet. */
+    this.requestPending = false;
+    connection.addEventListener("message", (event) => {
+      this.#receive(/** @type {CustomEvent} */ (event).detail);
+    });
+    for (const name of ["picture", "undecodable"]) {
       connection.addEventListener(name, (event) => {
         this.dispatchEvent(new CustomEvent(name, { detail: /** @type {CustomEvent} */ (event).detail }));
       });
@@ -24,44 +33,47 @@ export class ViewerLink extends EventTarget {
   }
 
   /** @param {any} message */
-  #hear(message) {
+  #receive(message) {
     if (message.type === "welcome") {
-      this.lastLook = "";
-      this.leastGapMs = Math.max(16, 2000 / message.limits.messages_per_s);
+      this.lastRequest = "";
+      const intervalMs = 1000 / (MESSAGE_SHARE * message.limits.messages_per_s);
+      this.minIntervalMs = Math.max(MIN_INTERVAL_MS, intervalMs);
     }
     this.dispatchEvent(new CustomEvent(message.type, { detail: message }));
   }
 
   /**
-   * Ask for a view unless it is what was asked for last, or it comes too soon after that: call it again a frame later.
-   * @param {object} look without `type`, `id` and `sent_ms`
+   * Request a view, unless it was the last one requested. If this is too soon after the last request, call it
+   * again a frame later.
+   * @param {object} view the message "look" without `type`, `id` and `sent_ms`
    * @returns {boolean} whether it was sent
    */
-  look(look) {
-    const asked = JSON.stringify(look);
+  requestView(view) {
+    const request = JSON.stringify(view);
     const now = performance.now();
-    this.late = asked !== this.lastLook && now - this.lastSent < this.leastGapMs;
-    if (asked === this.lastLook || this.late) return false;
-    if (!this.connection.send({ type: "look", id: this.looks + 1, sent_ms: now, ...look })) return false;
-    this.looks += 1;
-    this.lastLook = asked;
-    this.lastSent = now;
+    this.requestPending = request !== this.lastRequest && now - this.lastSentAt < this.minIntervalMs;
+    if (request === this.lastRequest || this.requestPending) return false;
+    const message = { type: "look", id: this.requestCount + 1, sent_ms: now, ...view };
+    if (!this.connection.send(message)) return false;
+    this.requestCount += 1;
+    this.lastRequest = request;
+    this.lastSentAt = now;
     return true;
   }
 
-  /** Give up what was asked for, and do not ask for a view. */
-  rest() {
-    this.late = false;
-    if (this.lastLook && this.connection.send({ type: "cancel" })) this.lastLook = "";
+  /** Cancel the last request. */
+  cancelRequest() {
+    this.requestPending = false;
+    if (this.lastRequest && this.connection.send({ type: "cancel" })) this.lastRequest = "";
   }
 
-  /** Show all who watch what is looked at here. @param {boolean} on */
-  onAir(on) {
+  /** Start or stop the broadcast of this page's view. @param {boolean} on */
+  setOnAir(on) {
     this.connection.send({ type: "on_air", on });
   }
 
-  /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} clock */
-  clock(clock) {
-    this.connection.send({ type: "clock", ...clock });
+  /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} change */
+  changeClock(change) {
+    this.connection.send({ type: "clock", ...change });
   }
 }

@@ -1,28 +1,31 @@
-// The socket, and the decoders of its messages. They run in a thread of their own: on the page's thread, every step of a
-// decoder would wait for a repaint.
+// The socket, and the decoders of its messages. They run in a worker, because on the page's thread every step
+// of a decoder would wait for a repaint.
 
 import { decodeDepth, parseFrame } from "./frames.js";
 import { PictureDecoder } from "./pictures.js";
-import { surfaceOf } from "../draw/surface.js";
+import { buildSurface } from "../draw/surface.js";
 
 /**
- * @typedef {{open: string} | {send: string} | {close: string} | {taken: true}} Order what the page wants: a socket to this
- *   address in place of the last, a text to be sent, an end with this reason; or that it has taken a picture
+ * @typedef {{open: string} | {send: string} | {close: string} | {taken: true}} Command open a socket to a URL
+ *   in place
+ *   of the last one, send a text, close the socket with a reason, or note that the page has taken a frame
  * @typedef {import("../draw/stage.js").Shown & {bytes: number}} Picture
- * @typedef {{opened: true} | {closed: {code: number, reason: string}} | {text: string} | {picture: Picture} | {trouble: string}} News
+ * @typedef {{opened: true} | {closed: {code: number, reason: string}} | {text: string} | {picture: Picture}
+ *   | {undecodable: string}} Report
  */
 
 /** @type {WebSocket | null} */
 let socket = null;
 let decoder = new PictureDecoder();
+/** Resolves when all frames so far were delivered. */
 let queue = Promise.resolve();
-/** Pictures that came and that the page has not taken: a page that repaints slowly must not pile them up. */
+/** Frames that the page has not taken yet. They must not accumulate if the page repaints slowly. */
 let untaken = 0;
-/** The acknowledgement of the second of them waits until the page has taken the first. @type {(() => void) | null} */
-let heldBack = null;
+/** Acknowledges the second of them, after the page has taken the first. @type {(() => void) | null} */
+let acknowledgeNext = null;
 
-/** @param {News} news @param {Transferable[]} [transfer] */
-const post = (news, transfer = []) => postMessage(news, /** @type {any} */ (transfer));
+/** @param {Report} report @param {Transferable[]} [transfer] */
+const post = (report, transfer = []) => postMessage(report, /** @type {any} */ (transfer));
 
 /** @param {string} url */
 function open(url) {
@@ -33,12 +36,12 @@ function open(url) {
   decoder.close();
   decoder = new PictureDecoder();
   untaken = 0;
-  heldBack = null;
+  acknowledgeNext = null;
   own.onopen = () => post({ opened: true });
   own.onmessage = ({ data }) => {
     if (socket !== own) return;
     if (typeof data === "string") post({ text: data });
-    else take(own, data);
+    else receiveFrame(own, data);
   };
   own.onclose = ({ code, reason }) => {
     if (socket !== own) return;
@@ -47,15 +50,24 @@ function open(url) {
   };
 }
 
-/** Images are decoded in parallel and delivered in order. @param {WebSocket} from @param {ArrayBuffer} message */
-function take(from, message) {
+/**
+ * Decode a frame; frames are decoded in parallel and delivered in order.
+ * @param {WebSocket} from
+ * @param {ArrayBuffer} message
+ */
+function receiveFrame(from, message) {
   const frame = parseFrame(message);
+
+  // acknowledge it now if the page has taken all others, else later
   const acknowledge = () => {
-    if (from.readyState === WebSocket.OPEN) from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));
+    if (from.readyState !== WebSocket.OPEN) return;
+    from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));
   };
   untaken += 1;
   if (untaken === 1) acknowledge();
-  else heldBack = acknowledge;
+  else acknowledgeNext = acknowledge;
+
+  // decode and deliver it
   const decoded = decode(frame);
   decoded.catch(() => {});
   queue = queue
@@ -65,43 +77,44 @@ function take(from, message) {
     })
     .catch((error) => {
       if (socket !== from) return;
-      letGo();
-      post({ trouble: String(error.message ?? error) });
+      countTaken();
+      post({ undecodable: String(error.message ?? error) });
     });
 }
 
-/** The page has taken a picture, or there is none to take: the server may send the next. */
-function letGo() {
+/** Note that the page has taken a frame, or that there is none to take: the server may send the next one. */
+function countTaken() {
   untaken = Math.max(0, untaken - 1);
-  heldBack?.();
-  heldBack = null;
+  acknowledgeNext?.();
+  acknowledgeNext = null;
 }
 
 /** @param {ReturnType<typeof parseFrame>} frame */
 async function decode({ header, parts }) {
-  const eyes = header.cameras.map(() => ({ modes: /** @type {any} */ ({}), surface: /** @type {any} */ (null) }));
+  const eyes = header.cameras.map(() => {
+    return { modes: /** @type {any} */ ({}), surface: /** @type {any} */ (null) };
+  });
   /** @type {Transferable[]} */
   const transfer = [];
-  await Promise.all(
-    parts.map(async (part) => {
-      const eye = eyes[part.about.eye ?? 0];
-      if (part.about.kind === "image") {
-        const picture = await decoder.decode(part, header.frame);
-        eye.modes[part.about.mode] = picture;
-        transfer.push(picture);
-      } else if (part.about.kind === "depth") {
-        const surface = surfaceOf(await decodeDepth(part), header.width, header.height);
-        eye.surface = surface;
-        transfer.push(surface.vertices.buffer, surface.solid.buffer, surface.stretched.buffer);
-      }
-    }),
-  );
+  const decodePart = async (/** @type {import("./frames.js").Part} */ part) => {
+    const eye = eyes[part.about.eye ?? 0];
+    if (part.about.kind === "image") {
+      const image = await decoder.decode(part, header.frame);
+      eye.modes[part.about.mode] = image;
+      transfer.push(image);
+    } else if (part.about.kind === "depth") {
+      const surface = buildSurface(await decodeDepth(part), header.width, header.height);
+      eye.surface = surface;
+      transfer.push(surface.vertices.buffer, surface.solid.buffer, surface.stretched.buffer);
+    }
+  };
+  await Promise.all(parts.map(decodePart));
   return { eyes, transfer };
 }
 
-onmessage = ({ data: order }) => {
-  if ("open" in order) open(order.open);
-  else if ("send" in order) socket?.send(order.send);
-  else if ("taken" in order) letGo();
-  else socket?.close(1000, order.close);
+onmessage = ({ data: command }) => {
+  if ("open" in command) open(command.open);
+  else if ("send" in command) socket?.send(command.send);
+  else if ("taken" in command) countTaken();
+  else socket?.close(1000, command.close);
 };

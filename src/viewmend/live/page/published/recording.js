@@ -1,120 +1,140 @@
-// The clock of a published performance: what a server's messages "rig" and "state" say, from one file.
+// The clock of a published performance, which takes the place of a server's messages "rig" and "state".
 
 import { add, length, scale, sub } from "../view/matrix.js";
-import { poseOf, timeOf } from "../view/url_state.js";
+import { parsePose, parseFrameIndex } from "../view/url_state.js";
 
-/** Between two states while time runs. */
-const GAP_MS = 500;
-/** A turntable leaves this share of its pictures free around the subject. */
+/** The state is dispatched at this interval, in milliseconds. */
+const STATE_MS = 500;
+/** A turntable leaves this share of its images free around the subject. */
 const MARGIN = 0.06;
+/** A turntable is at least this many radii from the subject's centre. */
+const MIN_RADII = 1.2;
 
 /**
- * Events: "rig" and "state", as link/viewer.js dispatches them; "show" where the address was changed; and "status", as
- * link/connection.js does.
+ * Replaces the connection and the link to a server. Events: "rig" and "state", as link/viewer.js dispatches
+ * them; "show" if the URL was changed; and "status", as link/connection.js does.
  */
 export class Recording extends EventTarget {
   /** @param {() => Promise<Response>} load fetches scene.json */
   constructor(load) {
     super();
     this.load = load;
-    /** What scene.json says. @type {any} */
+    /** The content of scene.json. @type {any} */
     this.scene = null;
-    /** No view is ever asked for. */
-    this.late = false;
-    this.lastLook = "";
+    /** Nothing is requested: the page draws all views. */
+    this.requestPending = false;
+    this.lastRequest = "";
     this.playing = true;
     this.speed = 1;
     /** The position at a moment, in frames. */
-    this.from = { position: 0, at: performance.now() };
+    this.anchor = { position: 0, at: performance.now() };
   }
 
   async open() {
-    this.#status("connecting", "");
+    this.#reportStatus("connecting", "");
     try {
-      const answer = await this.load();
-      if (!answer.ok) throw new Error(`scene.json: the host answered ${answer.status}`);
-      this.scene = await answer.json();
+      const response = await this.load();
+      if (!response.ok) throw new Error(`scene.json: the host answered ${response.status}`);
+      this.scene = await response.json();
     } catch (error) {
       this.fail(String(/** @type {Error} */ (error).message ?? error));
       return;
     }
-    this.from.at = performance.now();
-    this.#status("open", "");
+    this.anchor.at = performance.now();
+    this.#reportStatus("open", "");
     this.#dispatch("rig", this.scene.rig);
-    this.#state();
-    setInterval(() => this.#state(), GAP_MS);
-    window.addEventListener("hashchange", () => this.#follow());
+    this.#reportState();
+    setInterval(() => this.#reportState(), STATE_MS);
+    window.addEventListener("hashchange", () => this.#showUrl());
   }
 
-  /** @param {string} why */
-  fail(why) {
-    this.#status("refused", why);
+  /** Report an error that cannot be resolved. @param {string} text */
+  fail(text) {
+    this.#reportStatus("refused", text);
   }
 
-  /** There is no server that could draw a view. */
-  look() {
+  /** Do nothing: there is no server to render a view. */
+  requestView() {
     return false;
   }
 
-  rest() {}
+  cancelRequest() {}
 
-  onAir() {}
+  setOnAir() {}
 
   /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} change */
-  clock({ playing, speed, seek, live }) {
-    this.#go(seek ?? this.#position());
+  changeClock({ playing, speed, seek, live }) {
+    this.#setPosition(seek ?? this.#computePosition());
     if (speed !== undefined) this.speed = speed;
     if (playing !== undefined) this.playing = playing;
     if (live) this.playing = true;
-    this.#state();
+    this.#reportState();
   }
 
-  /** The clock waits at a frame that is not there yet. @param {number} time */
-  hold(time) {
-    this.#go(time);
-    this.#state();
+  /** Wait at a frame that is not available yet. @param {number} time */
+  holdAt(time) {
+    this.#setPosition(time);
+    this.#reportState();
   }
 
   /**
-   * The distance and focal length at which the subject's box, over all frames, is in every picture of a turn.
-   * @param {Record<string, number>} asked
+   * Compute the distance and focal length at which every image of a turntable shows the subject's box over
+   * all frames.
+   * @param {Record<string, number>} request
    */
-  frame({ width, height }) {
+  fitTurntable({ width, height }) {
     const { low, high } = this.scene.motion;
     const target = scale(add(low, high), 0.5);
     const radius = length(sub(high, low)) / 2;
-    const distance = Math.max(this.scene.rig.home.distance, 1.2 * radius);
-    const f = ((1 - MARGIN) * Math.min(width, height) * Math.sqrt(distance ** 2 - radius ** 2)) / (2 * radius);
+    const distance = Math.max(this.scene.rig.home.distance, MIN_RADII * radius);
+    const free = (1 - MARGIN) * Math.min(width, height);
+    const f = (free * Math.sqrt(distance ** 2 - radius ** 2)) / (2 * radius);
     return { target, distance, f };
   }
 
   /** @param {number} position frames */
-  #go(position) {
-    this.from = { position, at: performance.now() };
+  #setPosition(position) {
+    this.anchor = { position, at: performance.now() };
   }
 
-  #position() {
+  /** @returns {number} frames */
+  #computePosition() {
     const { frames, rig } = this.scene;
-    const gone = this.playing ? ((performance.now() - this.from.at) / 1000) * this.speed * (rig.fps ?? 0) : 0;
-    return (this.from.position + gone) % frames;
+    const seconds = (performance.now() - this.anchor.at) / 1000;
+    const played = this.playing ? seconds * this.speed * (rig.fps ?? 0) : 0;
+    return (this.anchor.position + played) % frames;
   }
 
-  /** The view of an address that was opened in this page. */
-  #follow() {
-    const asked = new URLSearchParams(location.hash.slice(1));
-    const time = timeOf(asked.get("time"));
-    this.#dispatch("show", { pose: poseOf(asked.get("pose")), mode: asked.get("mode") ?? "completed", ...(time < 0 ? {} : { time }) });
+  /** Show the view of the URL, which was changed. */
+  #showUrl() {
+    const query = new URLSearchParams(location.hash.slice(1));
+    const time = parseFrameIndex(query.get("time"));
+    this.#dispatch("show", {
+      pose: parsePose(query.get("pose")),
+      mode: query.get("mode") ?? "completed",
+      ...(time < 0 ? {} : { time }),
+    });
   }
 
-  #state() {
+  #reportState() {
     const { frames } = this.scene;
     const { playing, speed } = this;
-    const clock = { playing, speed, live: playing && speed === 1, behind: 0, time: Math.floor(this.#position()) };
-    this.#dispatch("state", { kind: "recording", first: 0, end: frames, total: frames, source: "ready", ...clock });
+    this.#dispatch("state", {
+      kind: "recording",
+      first: 0,
+      end: frames,
+      total: frames,
+      source: "ready",
+      playing,
+      speed,
+      live: playing && speed === 1,
+      behind: 0,
+      time: Math.floor(this.#computePosition()),
+    });
   }
 
   /** @param {string} status @param {string} text */
-  #status(status, text) {
+  #reportStatus(status, text) {
     this.#dispatch("status", { status, text, wait_s: 0 });
   }
 

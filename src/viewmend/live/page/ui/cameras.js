@@ -1,140 +1,181 @@
-// The rig's cameras: a list to snap to, labels over the picture, and which of them colour it.
+// The cameras of the rig: a list to choose from, labels over the image, and marks of those that colour the
+// view.
 
 import { project } from "../draw/projection.js";
 import { byId, element } from "./dom.js";
-import { AT_CAMERA } from "../settings.js";
+import { isCameraOnly } from "../settings.js";
 
-/** @param {number[]} colour */
-const css = (colour) => `rgb(${colour.map(Math.round).join(" ")})`;
+/** Ids of the elements that have a button for each camera. */
+const LISTS = ["cameras", "labels"];
+/** A visual hull needs at least this many cameras. */
+const MIN_INPUTS = 2;
+
+/** @param {number[]} colour RGB */
+const formatColour = (colour) => `rgb(${colour.map(Math.round).join(" ")})`;
 
 export class CameraList {
-  /** @param {import("../settings.js").Settings} settings @param {(camera: any) => void} snap */
+  /**
+   * @param {import("../settings.js").Settings} settings
+   * @param {(camera: any) => void} snap moves to a camera
+   */
   constructor(settings, snap) {
     this.settings = settings;
     this.snap = snap;
     /** The camera that the view is at. @type {any} */
-    this.here = null;
+    this.current = null;
     byId("input").addEventListener("change", () => this.toggleInput());
     byId("inputs-all").addEventListener("click", () => settings.set("without", ""));
     /** @type {any[]} */
     this.cameras = [];
-    this.last = -1;
-    this.used = "";
-    /** What was shown before a camera was left out; null if nothing else was. @type {{mode: string, left: string, right: string} | null} */
-    this.before = null;
-    settings.watch(["without"], () => this.#inputs());
+    /** The index of the camera chosen last. */
+    this.lastIndex = -1;
+    /** The marked cameras and their colours, as JSON. */
+    this.marked = "";
+    /**
+     * The modes before a camera was left out; null if they are still shown.
+     * @type {{mode: string, left: string, right: string} | null}
+     */
+    this.modesBefore = null;
+    settings.watch(["without"], () => this.#showInputs());
   }
 
   /** @param {any} rig */
-  set(rig) {
+  setRig(rig) {
     this.cameras = rig.cameras;
-    this.used = "";
-    const make = (/** @type {any} */ camera, /** @type {number} */ index) => {
-      const button = element("button", { type: "button", textContent: camera.name, title: `Go to ${camera.name}` });
-      button.addEventListener("click", () => this.to(index));
+    this.marked = "";
+    const buildButton = (/** @type {any} */ camera, /** @type {number} */ index) => {
+      const title = `Go to ${camera.name}`;
+      const button = element("button", { type: "button", textContent: camera.name, title });
+      button.addEventListener("click", () => this.goTo(index));
       return button;
     };
-    byId("cameras").replaceChildren(...this.cameras.map(make));
-    byId("labels").replaceChildren(...this.cameras.map(make));
+    for (const list of LISTS) {
+      byId(list).replaceChildren(...this.cameras.map(buildButton));
+    }
     for (const label of byId("labels").children) label.tabIndex = -1;
-    this.#inputs();
-    this.use([], undefined);
+    this.#showInputs();
+    this.markUsed([], undefined);
   }
 
-  /** Leave the camera that the view is at out, or use it again. */
+  /** Leave out the camera that the view is at, or use it again. */
   toggleInput() {
-    if (!this.here || byId("input").disabled) return;
-    const { settings, here: { name } } = this;
-    const without = settings.without;
-    const leavesOut = !without.includes(name);
-    const others = without.filter((/** @type {string} */ other) => other !== name);
-    settings.set("without", (leavesOut ? [...without, name] : others).join(","));
+    if (!this.current || byId("input").disabled) return;
+    const { settings } = this;
+    const { name } = this.current;
+    const excluded = settings.excludedCameras;
+    const leavesOut = !excluded.includes(name);
+    const others = excluded.filter((/** @type {string} */ other) => other !== name);
+    settings.set("without", (leavesOut ? [...excluded, name] : others).join(","));
     if (!leavesOut) this.#endComparison();
-    else if (!settings.shown.some((value) => AT_CAMERA.includes(value))) this.#beginComparison();
+    else if (!settings.shownModes.some(isCameraOnly)) this.#beginComparison();
   }
 
   /** Compare the view with the camera's image. */
   #beginComparison() {
     const { settings } = this;
-    this.before = { mode: settings.get("mode"), left: settings.get("left"), right: settings.get("right") };
+    this.modesBefore = {
+      mode: settings.get("mode"),
+      left: settings.get("left"),
+      right: settings.get("right"),
+    };
     settings.set("left", "completed");
     settings.set("right", "original");
     settings.set("mode", "split");
   }
 
-  /** Return to what was shown before the comparison, unless something else was chosen since. */
+  /** Return to the modes before the comparison, unless others were chosen since. */
   #endComparison() {
-    const { settings, before } = this;
-    this.before = null;
-    if (!before || settings.get("mode") !== "split" || settings.get("right") !== "original") return;
-    settings.set("mode", before.mode);
-    settings.set("left", before.left);
-    settings.set("right", before.right);
+    const { settings, modesBefore } = this;
+    this.modesBefore = null;
+    if (!modesBefore || settings.get("mode") !== "split" || settings.get("right") !== "original") return;
+    settings.set("mode", modesBefore.mode);
+    settings.set("left", modesBefore.left);
+    settings.set("right", modesBefore.right);
   }
 
   /** @param {any} camera the one that the view is at; null for none */
-  at(camera) {
-    if (camera === this.here) return;
-    this.here = camera;
-    this.#inputs();
+  setCurrent(camera) {
+    if (camera === this.current) return;
+    this.current = camera;
+    this.#showInputs();
   }
 
-  /** Which cameras are inputs. */
-  #inputs() {
-    const without = this.settings.without;
-    for (const list of ["cameras", "labels"]) {
-      this.cameras.forEach(({ name }, index) => byId(list).children[index]?.toggleAttribute("data-off", without.includes(name)));
+  /** Show which cameras are inputs. */
+  #showInputs() {
+    const excluded = this.settings.excludedCameras;
+    for (const list of LISTS) {
+      this.cameras.forEach(({ name }, index) => {
+        byId(list).children[index]?.toggleAttribute("data-off", excluded.includes(name));
+      });
     }
-    const off = this.here && without.includes(this.here.name);
-    byId("input-row").hidden = !this.here;
-    byId("input-name").textContent = this.here ? `Use ${this.here.name} as an input` : "";
+    const { current } = this;
+    const off = current && excluded.includes(current.name);
+    byId("input-row").hidden = !current;
+    byId("input-name").textContent = current ? `Use ${current.name} as an input` : "";
     byId("input").checked = !off;
-    byId("input").disabled = !off && this.cameras.length - without.length <= 2; // a hull needs two
-    byId("inputs-all").hidden = !without.length;
-    this.used = "";
+    byId("input").disabled = !off && this.cameras.length - excluded.length <= MIN_INPUTS;
+    byId("inputs-all").hidden = !excluded.length;
+    this.marked = "";
   }
 
   /** @param {number} index */
-  to(index) {
-    this.last = index;
+  goTo(index) {
+    this.lastIndex = index;
     this.snap(this.cameras[index]);
   }
 
   /** @param {number} steps along the list */
-  next(steps) {
+  goToNext(steps) {
     const count = this.cameras.length;
-    if (count) this.to((Math.max(this.last, steps < 0 ? 0 : -1) + steps + count) % count);
+    if (!count) return;
+    const from = Math.max(this.lastIndex, steps < 0 ? 0 : -1);
+    this.goTo((from + steps + count) % count);
   }
 
-  /** Which cameras colour the picture. @param {string[]} sources @param {number[][] | undefined} colours @returns {boolean} whether it changed */
-  use(sources, colours) {
-    const used = JSON.stringify([sources, colours]);
-    if (used === this.used) return false;
-    this.used = used;
+  /**
+   * Mark the cameras that colour the view.
+   * @param {string[]} names
+   * @param {number[][] | undefined} colours of the mode "coverage"
+   * @returns {boolean} whether they have changed
+   */
+  markUsed(names, colours) {
+    const marked = JSON.stringify([names, colours]);
+    if (marked === this.marked) return false;
+    this.marked = marked;
     this.cameras.forEach((camera, index) => {
-      const place = sources.indexOf(camera.name);
-      for (const list of ["cameras", "labels"]) {
+      const rank = names.indexOf(camera.name);
+      const used = rank >= 0;
+      for (const list of LISTS) {
         const button = byId(list).children[index];
-        button.toggleAttribute("data-used", place >= 0);
-        if (place >= 0 && colours?.[place]) button.style.setProperty("--colour", css(colours[place]));
+        button.toggleAttribute("data-used", used);
+        if (used && colours?.[rank]) button.style.setProperty("--colour", formatColour(colours[rank]));
         else button.style.removeProperty("--colour");
       }
     });
-    const out = this.settings.without.length;
-    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} used for this view${out ? `, ${out} left out` : ""}`;
+    const excluded = this.settings.excludedCameras.length;
+    const suffix = excluded ? `, ${excluded} left out` : "";
+    const count = `${names.length} of ${this.cameras.length}`;
+    byId("camera-count").textContent = `${count} used for this view${suffix}`;
     return true;
   }
 
-  /** @param {boolean} shown @param {any} viewer in CSS pixels @param {{left: number, top: number}} box where the picture is */
-  place(shown, viewer, box) {
+  /**
+   * Place the labels over the image.
+   * @param {boolean} shown
+   * @param {any} viewer in CSS pixels
+   * @param {{left: number, top: number}} box of the image
+   */
+  placeLabels(shown, viewer, box) {
     const labels = byId("labels");
     labels.hidden = !shown;
     if (!shown) return;
     this.cameras.forEach((camera, index) => {
-      const at = project(viewer, camera.center);
+      const pixel = project(viewer, camera.center);
       const label = labels.children[index];
-      label.hidden = !at;
-      if (at) label.style.transform = `translate(${at[0] + box.left}px, ${at[1] + box.top}px) translate(-50%, 9px)`;
+      label.hidden = !pixel;
+      if (!pixel) return;
+      const position = `${pixel[0] + box.left}px, ${pixel[1] + box.top}px`;
+      label.style.transform = `translate(${position}) translate(-50%, 9px)`;
     });
   }
 }

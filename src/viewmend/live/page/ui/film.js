@@ -1,15 +1,19 @@
-// A film that the server renders: how far it is, how long it will still take, and a way to call it off.
+// A video that the server renders: its progress, the remaining time, and a way to cancel it.
 
-import { address } from "../link/address.js";
+import { buildAddress } from "../link/address.js";
 
-const ASK_MS = 500;
+/** The progress is requested at this interval, in milliseconds. */
+const POLL_MS = 500;
 
 export class Film {
-  /** @param {string | null} token @param {(progress: {part: number, text: string}) => void} onProgress called while it is rendered */
+  /**
+   * @param {string | null} token
+   * @param {(progress: {part: number, text: string}) => void} onProgress called while the video is rendered
+   */
   constructor(token, onProgress) {
     this.token = token;
     this.onProgress = onProgress;
-    this.since = performance.now();
+    this.startedAt = performance.now();
     this.stopped = new AbortController();
   }
 
@@ -17,18 +21,26 @@ export class Film {
     this.stopped.abort();
   }
 
-  /** @param {object} request what is posted @returns {Promise<Blob | null>} null where it was called off */
+  /**
+   * Render the video.
+   * @param {object} request
+   * @returns {Promise<Blob | null>} null if it was cancelled
+   */
   async make(request) {
-    const timer = setInterval(() => void this.#ask(), ASK_MS);
+    const timer = setInterval(() => void this.#updateProgress(), POLL_MS);
     const { signal } = this.stopped;
     try {
-      const headers = { "content-type": "application/json" };
-      const answer = await fetch(address("path.mp4", this.token), { method: "POST", headers, body: JSON.stringify(request), signal });
-      if (!answer.ok) {
-        const said = await answer.json().catch(() => ({}));
-        throw new Error(said.error ?? `the server answered ${answer.status}`);
+      const response = await fetch(buildAddress("path.mp4", this.token), {
+        method: "POST",
+        headers: { "content-type": "application/json" },
+        body: JSON.stringify(request),
+        signal,
+      });
+      if (!response.ok) {
+        const content = await response.json().catch(() => ({}));
+        throw new Error(content.error ?? `the server answered ${response.status}`);
       }
-      return await answer.blob();
+      return await response.blob();
     } catch (error) {
       if (signal.aborted) return null;
       throw error;
@@ -37,13 +49,13 @@ export class Film {
     }
   }
 
-  async #ask() {
-    const answer = await fetch(address("path", this.token)).catch(() => null);
-    if (!answer?.ok) return;
-    const { done, of } = await answer.json();
+  async #updateProgress() {
+    const response = await fetch(buildAddress("path", this.token)).catch(() => null);
+    if (!response?.ok) return;
+    const { done, of } = await response.json();
     if (!of) return;
-    const seconds = (performance.now() - this.since) / 1000;
-    const left = done > 0 ? `, about ${Math.ceil((seconds / done) * (of - done))} s left` : "";
-    this.onProgress({ part: done / of, text: `${done} of ${of} views${left}` });
+    const seconds = (performance.now() - this.startedAt) / 1000;
+    const remaining = done > 0 ? `, about ${Math.ceil((seconds / done) * (of - done))} s left` : "";
+    this.onProgress({ part: done / of, text: `${done} of ${of} views${remaining}` });
   }
 }

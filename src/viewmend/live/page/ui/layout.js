@@ -1,12 +1,15 @@
-// Which part of the page nothing covers: the subject is put in its middle.
+// Measures the part of the page that no panel covers; the subject is shown in its middle.
 
 import { byId } from "./dom.js";
 
 /** @typedef {import("../view/lens.js").Box} Box */
 
+/** The free part is at least this wide and high, in CSS pixels. */
+const MIN_SIDE = 60;
+/** Matches narrow pages, where the panel is at the bottom. */
 const NARROW = window.matchMedia("(max-width: 760px)");
 
-/** Keeps `free` up to date and calls back when it changes. */
+/** Keeps the boxes `page` and `free` up to date, and calls back when they change. */
 export class Layout {
   /** @param {import("../settings.js").Settings} settings @param {() => void} changed */
   constructor(settings, changed) {
@@ -23,14 +26,15 @@ export class Layout {
       byId("tool-panel").setAttribute("aria-pressed", String(settings.get("panel")));
       this.measure();
     });
-    this.#tabs();
+    this.#listenToTabs();
   }
 
   get narrow() {
     return NARROW.matches;
   }
 
-  #tabs() {
+  /** Open and close the sections of a narrow page. */
+  #listenToTabs() {
     const tabs = byId("tabs");
     tabs.addEventListener("click", (/** @type {Event} */ event) => {
       const tab = /** @type {Element} */ (event.target).closest("button");
@@ -45,15 +49,26 @@ export class Layout {
 
   measure() {
     const { innerWidth: width, innerHeight: height } = window;
-    const box = (/** @type {string} */ query) => /** @type {Element} */ (document.querySelector(query)).getBoundingClientRect();
-    const [bar, panel, dock] = [box(".bar"), box(".panel"), box(".dock")];
+    const bar = measureElement(".bar");
+    const panel = measureElement(".panel");
+    const dock = measureElement(".dock");
     const covered = panel.width > 0;
     const right = covered && !this.narrow ? panel.left : width;
     const bottom = Math.min(dock.top, covered && this.narrow ? panel.top : height);
     this.page = { left: 0, top: 0, width, height };
-    this.free = { left: 0, top: bar.bottom, width: Math.max(60, right), height: Math.max(60, bottom - bar.bottom) };
+    this.free = {
+      left: 0,
+      top: bar.bottom,
+      width: Math.max(MIN_SIDE, right),
+      height: Math.max(MIN_SIDE, bottom - bar.bottom),
+    };
     document.body.style.setProperty("--middle", `${this.free.left + this.free.width / 2}px`);
     document.body.style.setProperty("--centre", `${this.free.top + this.free.height / 2}px`);
     this.changed();
   }
+}
+
+/** Measure an element, which must exist. @param {string} selector */
+function measureElement(selector) {
+  return /** @type {Element} */ (document.querySelector(selector)).getBoundingClientRect();
 }

@@ -1,40 +1,46 @@
-// On air: what this page shows is the film that all who open /watch see.
+// The broadcast: this page's view is what spectators see on /watch.
 
-import { address } from "../link/address.js";
+import { buildAddress } from "../link/address.js";
 import { byId } from "./dom.js";
 
 export class OnAir {
-  /** @param {import("../link/viewer.js").ViewerLink} link @param {import("./notices.js").Notices} notices @param {string | null} token */
+  /**
+   * @param {import("../link/viewer.js").ViewerLink} link
+   * @param {import("./notices.js").Notices} notices
+   * @param {string | null} token
+   */
   constructor(link, notices, token) {
     this.link = link;
     this.notices = notices;
     this.token = token;
-    /** What the person wants, and what the server says. */
+    /** Whether the user wants to broadcast. */
     this.wanted = false;
+    /** Whether the server broadcasts this page's view. */
     this.on = false;
     this.button = byId("tool-air");
-    this.button.addEventListener("click", () => this.#want(!this.wanted));
-    link.addEventListener("welcome", (event) => this.#welcome(/** @type {CustomEvent} */ (event).detail));
-    link.addEventListener("state", (event) => this.#state(/** @type {CustomEvent} */ (event).detail));
+    this.button.addEventListener("click", () => this.#setWanted(!this.wanted));
+    link.addEventListener("welcome", (event) => this.#resume(/** @type {CustomEvent} */ (event).detail));
+    link.addEventListener("state", (event) => this.#update(/** @type {CustomEvent} */ (event).detail));
   }
 
   /** @param {boolean} on */
-  #want(on) {
+  #setWanted(on) {
     this.wanted = on;
-    this.link.onAir(on);
-    const where = address("watch", this.token).href;
-    this.notices.toast(on ? `Broadcasting your view: ${where}` : "Broadcast stopped; spectators keep the last view.");
+    this.link.setOnAir(on);
+    const url = buildAddress("watch", this.token).href;
+    const stopped = "Broadcast stopped; spectators keep the last view.";
+    this.notices.toast(on ? `Broadcasting your view: ${url}` : stopped);
   }
 
-  /** A server that was left may have forgotten it. @param {any} welcome */
-  #welcome(welcome) {
+  /** Resume the broadcast after a lost connection. @param {any} welcome the message */
+  #resume(welcome) {
     this.button.hidden = !welcome.broadcast;
     this.on = false;
-    if (this.wanted && welcome.broadcast) this.link.onAir(true);
+    if (this.wanted && welcome.broadcast) this.link.setOnAir(true);
   }
 
-  /** @param {any} state */
-  #state(state) {
+  /** @param {any} state the message */
+  #update(state) {
     if (this.on && !state.on_air && this.wanted) {
       this.wanted = false;
       this.notices.toast("Another viewer is broadcasting now.");

@@ -1,70 +1,95 @@
-// The image of the camera that the view is at, next to the view, and how far the view is from it if the camera is left out.
+// The image of the camera that the view is at, next to the view, and how far the view is from it if the
+// camera is left out.
 
-import { address } from "../link/address.js";
+import { buildAddress } from "../link/address.js";
 import { byId } from "./dom.js";
 import { Scores } from "./scores.js";
 
-/** Between two pictures while time runs. */
-const GAP_MS = 250;
+/** Images are requested at least this far apart, in milliseconds, while time runs. */
+const MIN_INTERVAL_MS = 250;
 
 export class Original {
-  /** @param {string | null} token @param {(mode: "original" | "error", camera: any, image: TexImageSource | null) => void} paint shows an image in the camera's place */
-  constructor(token, paint) {
+  /**
+   * @param {string | null} token
+   * @param {(mode: "original" | "error", camera: any, image: TexImageSource | null) => void} setPhoto shows
+   *   an image
+   *   at the camera
+   */
+  constructor(token, setPhoto) {
     this.token = token;
-    this.asked = "";
-    this.askedAt = -Infinity;
-    this.paint = paint;
-    /** Of the image that is shown. @type {any} */
+    /** URL of the image; "" for none. */
+    this.requestedUrl = "";
+    this.requestedAt = -Infinity;
+    this.setPhoto = setPhoto;
+    /** The camera of the image. @type {any} */
     this.camera = null;
-    this.shown = true;
+    /** Whether the image is shown next to the view. */
+    this.besideView = true;
     const image = byId("original-image");
     image.addEventListener("load", () => {
-      byId("original").hidden = this.asked === "" || !this.shown;
-      if (this.asked) paint("original", this.camera, image);
+      byId("original").hidden = this.requestedUrl === "" || !this.besideView;
+      if (this.requestedUrl) setPhoto("original", this.camera, image);
     });
     image.addEventListener("error", () => (byId("original").hidden = true));
-    this.scores = new Scores(token, (asked, score) => this.#score(asked, score));
+    this.scores = new Scores(token, (request, score) => this.#showScore(request, score));
   }
 
-  /** @param {any} camera the one that the view is at; null if it is at none @param {number} time the frame's index @param {boolean} shown whether next to the view */
-  show(camera, time, shown) {
-    this.shown = shown;
+  /**
+   * Show the image of a camera.
+   * @param {any} camera the one that the view is at; null if it is at none
+   * @param {number} time index of the frame
+   * @param {boolean} besideView whether it is shown next to the view
+   */
+  show(camera, time, besideView) {
+    this.besideView = besideView;
     if (!camera || time < 0) {
-      if (this.asked) this.paint("original", null, null);
-      this.asked = "";
+      if (this.requestedUrl) this.setPhoto("original", null, null);
+      this.requestedUrl = "";
       byId("original").hidden = true;
       return;
     }
-    const url = address("camera.jpg", this.token);
+    const url = buildAddress("camera.jpg", this.token);
     url.searchParams.set("name", camera.name);
     url.searchParams.set("time", String(time));
+
+    // wait for the last image
     const image = byId("original-image");
-    const busy = this.asked !== "" && (!image.complete || performance.now() - this.askedAt < GAP_MS);
-    if (url.href === this.asked || busy) return;
-    this.asked = url.href;
-    this.askedAt = performance.now();
+    const tooSoon = performance.now() - this.requestedAt < MIN_INTERVAL_MS;
+    const busy = this.requestedUrl !== "" && (!image.complete || tooSoon);
+    if (url.href === this.requestedUrl || busy) return;
+
+    this.requestedUrl = url.href;
+    this.requestedAt = performance.now();
     this.camera = camera;
     image.alt = `Image of ${camera.name}`;
     byId("original-name").textContent = `${camera.name}, original`;
     image.src = url.href;
   }
 
-  /** @param {import("./scores.js").Asked | null} asked @param {import("./scores.js").Score | null} score */
-  #score(asked, score) {
-    const [picture, name] = [byId("error-image"), byId("error-name")];
-    picture.hidden = name.hidden = !score;
-    if (!asked || !score) {
+  /**
+   * Show the PSNR of a model, and the error map of the server's own.
+   * @param {import("./scores.js").ScoreRequest | null} request
+   * @param {import("./scores.js").Score | null} score null to show none
+   */
+  #showScore(request, score) {
+    const image = byId("error-image");
+    const name = byId("error-name");
+    image.hidden = !score;
+    name.hidden = !score;
+    if (!request || !score) {
       name.textContent = "";
-      this.paint("error", null, null);
+      this.setPhoto("error", null, null);
       return;
     }
-    const text = `${score.model ? `${score.model}: ` : ""}${score.psnr.toFixed(1)} dB`;
-    name.textContent = name.textContent ? `${name.textContent} · ${text}` : `Error map · PSNR of subject ${text}`;
+    const model = score.model ? `${score.model}: ` : "";
+    const text = `${model}${score.psnr.toFixed(1)} dB`;
+    const before = name.textContent;
+    name.textContent = before ? `${before} · ${text}` : `Error map · PSNR of subject ${text}`;
     if (score.model) return;
-    picture.onload = () => {
-      this.paint("error", asked.camera, picture);
-      URL.revokeObjectURL(picture.src);
+    image.onload = () => {
+      this.setPhoto("error", request.camera, image);
+      URL.revokeObjectURL(image.src);
     };
-    picture.src = URL.createObjectURL(score.blob);
+    image.src = URL.createObjectURL(score.blob);
   }
 }

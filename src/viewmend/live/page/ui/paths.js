@@ -1,31 +1,36 @@
-// The section "Camera path": record, add views, play, and export as MP4.
+// The section "Camera path": record a path, add views, play it, and export it as MP4.
 
-import { fovOf, lensOf } from "../view/lens.js";
-import { FPS, MOST_POSES, Track } from "../view/camera_path.js";
-import { extrinsicsOf } from "../view/pose.js";
-import { pathFile, pointsOf } from "../view/camera_path_file.js";
+import { fovFromFocal, lensFromFov } from "../view/lens.js";
+import { FPS, MAX_POSES, Track } from "../view/camera_path.js";
+import { extrinsicsFromPose } from "../view/pose.js";
+import { buildPathFile, readPoints } from "../view/camera_path_file.js";
 import { byId, download, element } from "./dom.js";
 import { clamp } from "../view/matrix.js";
 
-/** How far a film's two eyes are apart, metres; players know by the name's end, _SBS, that they lie side by side. */
-const EYES_M = 0.064;
+/** The distance between the two eyes of a stereo video, in metres. */
+const EYE_DISTANCE_M = 0.064;
+/** The file name of a stereo video; players know by its end that the eyes are side by side. */
+const STEREO_NAME = "viewmend-path_SBS.mp4";
+/** The file name of any other video. */
+const NAME = "viewmend-path.mp4";
+/** The length of a turntable without a valid choice, in seconds. */
+const TURNTABLE_SECONDS = 6;
 
 /**
- * @typedef {object} FilmInMaking
- * @property {number} since when it was begun, ms
- * @property {(request: any) => Promise<Blob | null>} make null where it was called off
+ * @typedef {object} FilmInProgress
+ * @property {number} startedAt ms
+ * @property {(request: any) => Promise<Blob | null>} make null if it was cancelled
  * @property {() => void} cancel
  */
 
 /**
- * @typedef {object} Films what renders films
- * @property {(onProgress: (progress: {part: number, text: string}) => void) => FilmInMaking} make
- * @property {(asked: Record<string, number>) => Promise<{target: number[], distance: number, f: number}>} turntable the distance and
- *   the focal length in pixels at which every image shows the whole motion
+ * @typedef {object} Films what renders videos
+ * @property {(onProgress: (progress: {part: number, text: string}) => void) => FilmInProgress} make
+ *   finds the distance, and the focal length in pixels, at which every image shows the whole motion
  */
 
 /**
- * @typedef {object} Surroundings
+ * @typedef {object} PathContext parts of the page that the panel uses
  * @property {import("../view/motion.js").Motion} motion
  * @property {import("./transport.js").Transport} transport
  * @property {import("./notices.js").Notices} notices
@@ -35,26 +40,30 @@ const EYES_M = 0.064;
  */
 
 export class PathPanel {
-  /** @param {Surroundings} around */
-  constructor(around) {
-    this.around = around;
+  /** @param {PathContext} context */
+  constructor(context) {
+    this.context = context;
     this.track = new Track();
     this.recording = false;
-    /** @type {{since: number, hands: number} | null} */
+    /**
+     * When the preview began, and the user's movements until then.
+     * @type {{since: number, userMoves: number} | null}
+     */
     this.playing = null;
-    /** The film that is being rendered. @type {FilmInMaking | null} */
+    /** The video that is being rendered. @type {FilmInProgress | null} */
     this.film = null;
     this.progressText = "";
+    /** The listed views as JSON. */
     this.listed = "";
     byId("path-record").addEventListener("click", () => this.toggleRecording());
-    byId("path-add").addEventListener("click", () => this.#add());
-    byId("path-play").addEventListener("click", () => this.#play());
+    byId("path-add").addEventListener("click", () => this.#addView());
+    byId("path-play").addEventListener("click", () => this.#togglePreview());
     byId("path-clear").addEventListener("click", () => {
       this.track.clear();
       this.playing = null;
       this.#show();
     });
-    byId("path-turntable").addEventListener("click", () => void this.#turntable());
+    byId("path-turntable").addEventListener("click", () => void this.#makeTurntable());
     byId("path-export").addEventListener("click", () => this.#export());
     byId("path-cancel").addEventListener("click", () => this.film?.cancel());
     byId("path-save").addEventListener("click", () => this.#save());
@@ -65,14 +74,14 @@ export class PathPanel {
 
   toggleRecording() {
     this.playing = null;
-    this.recording = !this.recording && this.around.motion.pose !== null;
+    this.recording = !this.recording && this.context.motion.pose !== null;
     if (this.recording) this.track.start(performance.now());
     this.#show();
-    this.around.wake();
+    this.context.wake();
   }
 
-  #add() {
-    const { motion, transport } = this.around;
+  #addView() {
+    const { motion, transport } = this.context;
     if (!motion.goal) return;
     if (this.track.recordingSince >= 0) this.track.clear();
     this.recording = false;
@@ -80,23 +89,27 @@ export class PathPanel {
     this.#show();
   }
 
-  /** Around the subject at the height that is looked from, so that the film shows the whole motion. */
-  async #turntable() {
-    const { motion, transport, notices, films } = this.around;
+  /** Make a path around the subject at the current elevation, at a distance that shows the whole motion. */
+  async #makeTurntable() {
+    const { motion, transport, notices, films } = this.context;
     if (!motion.goal) return;
     this.recording = false;
     this.playing = null;
     const button = byId("path-turntable");
-    const [seconds, arc] = [clamp(Number(byId("path-seconds").value) || 6, 1, (MOST_POSES - 1) / FPS), Number(byId("path-arc").value)];
+    const maxSeconds = (MAX_POSES - 1) / FPS;
+    const seconds = clamp(Number(byId("path-seconds").value) || TURNTABLE_SECONDS, 1, maxSeconds);
+    const arc = Number(byId("path-arc").value);
     const { azimuth, elevation } = motion.goal;
     const time = Math.max(0, transport.shown);
     const frames = this.#still ? 1 : Math.ceil(seconds * (motion.rig.fps ?? 0)) + 1;
-    const { width, height } = this.#size();
+    const { width, height } = this.#readSize();
     button.disabled = true;
     try {
-      const { target, distance, f } = await films.turntable({ time, frames, azimuth, arc, elevation, width, height });
-      const fov = fovOf({ width, height }, f);
-      this.track.turntable({ target, azimuth, elevation, roll: 0, distance, fov }, arc, seconds, time);
+      const request = { time, frames, azimuth, arc, elevation, width, height };
+      const { target, distance, f } = await films.turntable(request);
+      const fov = fovFromFocal({ width, height }, f);
+      const pose = { target, azimuth, elevation, roll: 0, distance, fov };
+      this.track.turntable(pose, arc, seconds, time);
     } catch (error) {
       notices.toast(`Could not make the turntable: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
@@ -105,125 +118,191 @@ export class PathPanel {
     }
   }
 
-  /** The views that were added, to be put in order. */
-  #list() {
-    const { points, recordingSince } = this.track;
-    const change = (/** @type {() => void} */ edit) => () => {
-      edit();
-      this.playing = null;
-      this.#show();
-    };
-    const button = (/** @type {string} */ text, /** @type {string} */ label, /** @type {() => void} */ act, disabled = false) => {
-      const made = element("button", { type: "button", textContent: text, title: label, disabled });
-      made.setAttribute("aria-label", label);
-      made.addEventListener("click", act);
-      return made;
-    };
-    const rows = recordingSince >= 0 ? [] : points.map(({ pose, seconds }, index) => {
-      const view = `view ${index + 1}`;
-      const moment = element("input", { type: "number", min: 0, step: 0.1, value: seconds.toFixed(1), disabled: index === 0 });
-      moment.setAttribute("aria-label", `Seconds of ${view}`);
-      moment.addEventListener("change", change(() => this.track.retime(index, Number(moment.value))));
-      return element("li", {},
-        button(String(index + 1), `Go to ${view}`, () => {
-          this.around.motion.jump(pose);
-          this.around.wake();
-        }),
-        moment, element("span", { textContent: "s" }),
-        button("↑", `Move ${view} up`, change(() => this.track.move(index, -1)), index === 0),
-        button("↓", `Move ${view} down`, change(() => this.track.move(index, 1)), index === points.length - 1),
-        button("✕", `Delete ${view}`, change(() => this.track.remove(index))),
-      );
-    });
-    byId("path-views").replaceChildren(...rows);
-    byId("path-views").hidden = !rows.length;
-  }
-
-  #play() {
+  #togglePreview() {
     this.recording = false;
-    this.playing = this.playing ? null : { since: performance.now(), hands: this.around.motion.hands };
+    const { userMoves } = this.context.motion;
+    this.playing = this.playing ? null : { since: performance.now(), userMoves };
     this.#show();
-    this.around.wake();
+    this.context.wake();
   }
 
-  /** Once a repaint. @param {number} now ms @returns {boolean} whether the next repaint must come */
+  /**
+   * Record or play at each repaint.
+   * @param {number} now ms
+   * @returns {boolean} whether another repaint is needed
+   */
   step(now) {
-    const { motion, transport } = this.around;
+    const { motion, transport } = this.context;
     if (this.recording && motion.pose) {
       if (!this.track.record(motion.pose, transport.shown, now)) this.toggleRecording();
       this.#show();
     }
     if (this.playing) {
       const seconds = (now - this.playing.since) / 1000;
-      const over = seconds >= this.track.seconds || motion.hands !== this.playing.hands;
-      if (motion.hands === this.playing.hands) motion.put(this.track.at(Math.min(seconds, this.track.seconds)));
-      if (over) this.playing = null;
-      if (over) this.#show();
+      const interrupted = motion.userMoves !== this.playing.userMoves;
+      const over = seconds >= this.track.seconds || interrupted;
+      if (!interrupted) motion.jumpTo(this.track.at(Math.min(seconds, this.track.seconds)));
+      if (over) {
+        this.playing = null;
+        this.#show();
+      }
     }
     return this.recording || this.playing !== null;
   }
 
+  /** Update all controls of the section. */
   #show() {
-    const { points, seconds, recordingSince } = this.track;
+    const { points, recordingSince } = this.track;
     const ready = points.length > 1 && !this.recording;
+
+    // buttons
     const record = byId("path-record");
     record.setAttribute("aria-pressed", String(this.recording));
     record.lastElementChild.textContent = this.recording ? "Stop" : "Record";
-    const room = recordingSince >= 0 || this.track.room;
-    byId("path-add").disabled = !room;
+    byId("path-add").disabled = !this.#hasRoom;
     byId("path-play").disabled = !ready;
     byId("path-play").textContent = this.playing ? "Stop" : "Preview";
     byId("path-clear").disabled = !points.length || this.recording;
-    const button = byId("path-export");
-    button.disabled = !ready || this.film !== null;
-    button.classList.toggle("busy", this.film !== null);
-    button.textContent = this.film ? "Rendering" : "Export MP4";
     byId("path-save").disabled = !ready;
+
+    // export
+    const exportButton = byId("path-export");
+    exportButton.disabled = !ready || this.film !== null;
+    exportButton.classList.toggle("busy", this.film !== null);
+    exportButton.textContent = this.film ? "Rendering" : "Export MP4";
     byId("path-film").hidden = this.film === null;
-    let text = "Record a movement, or add views to fly through.";
-    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} view${points.length === 1 ? "" : "s"}, ${seconds.toFixed(0)} s${room ? "" : ", the maximum length"}`;
-    if (this.film && this.progressText) text = this.progressText;
+
+    // description
+    const text = this.film && this.progressText ? this.progressText : this.#describePath();
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
+
+    // list of views, which is not updated while recording
     const listed = JSON.stringify([recordingSince >= 0, points]);
     if (listed === this.listed || this.recording) return;
     this.listed = listed;
-    this.#list();
+    this.#listViews();
   }
 
-  /** Whether the film shows one frame only. */
+  /** Whether a view can be added; a recorded path is replaced by it. */
+  get #hasRoom() {
+    return this.track.recordingSince >= 0 || this.track.room;
+  }
+
+  #describePath() {
+    const { points, seconds, recordingSince } = this.track;
+    if (!points.length) return "Record a movement, or add views to fly through.";
+    if (recordingSince >= 0) return `${seconds.toFixed(1)} s recorded`;
+    const plural = points.length === 1 ? "" : "s";
+    const limit = this.#hasRoom ? "" : ", the maximum length";
+    return `${points.length} view${plural}, ${seconds.toFixed(0)} s${limit}`;
+  }
+
+  /** List the views that were added, to be sorted, timed and deleted. */
+  #listViews() {
+    const { points, recordingSince } = this.track;
+    const rows = recordingSince >= 0 ? [] : points.map((point, index) => this.#buildRow(point, index));
+    byId("path-views").replaceChildren(...rows);
+    byId("path-views").hidden = !rows.length;
+  }
+
+  /**
+   * Build the row of a view.
+   * @param {import("../view/camera_path.js").Point} point
+   * @param {number} index
+   */
+  #buildRow({ pose, seconds }, index) {
+    const { track } = this;
+    const { motion, wake } = this.context;
+    const name = `view ${index + 1}`;
+    const edit = (/** @type {() => void} */ change) => () => {
+      change();
+      this.playing = null;
+      this.#show();
+    };
+    const goTo = () => {
+      motion.moveTo(pose);
+      wake();
+    };
+    const isFirst = index === 0;
+    const isLast = index === track.points.length - 1;
+    const moment = element("input", {
+      type: "number",
+      min: 0,
+      step: 0.1,
+      value: seconds.toFixed(1),
+      disabled: isFirst,
+    });
+    moment.setAttribute("aria-label", `Seconds of ${name}`);
+    moment.addEventListener(
+      "change",
+      edit(() => track.retime(index, Number(moment.value))),
+    );
+    const moveUp = edit(() => track.move(index, -1));
+    const moveDown = edit(() => track.move(index, 1));
+    const remove = edit(() => track.remove(index));
+    return element(
+      "li",
+      {},
+      buildButton(String(index + 1), `Go to ${name}`, goTo),
+      moment,
+      element("span", { textContent: "s" }),
+      buildButton("↑", `Move ${name} up`, moveUp, isFirst),
+      buildButton("↓", `Move ${name} down`, moveDown, isLast),
+      buildButton("✕", `Delete ${name}`, remove),
+    );
+  }
+
+  /** Whether the video shows one frame only. */
   get #still() {
     return byId("path-time").value === "still";
   }
 
-  /** Of one eye's pictures. @param {boolean} [stereo] */
-  #size(stereo = byId("path-stereo").checked) {
-    const [across, height] = byId("path-size").value.split("x").map(Number);
-    return { width: stereo ? across / 2 : across, height };
+  /** Read the size of one eye's images. @param {boolean} [stereo] whether two eyes share the width */
+  #readSize(stereo = byId("path-stereo").checked) {
+    const [width, height] = byId("path-size").value.split("x").map(Number);
+    return { width: stereo ? width / 2 : width, height };
   }
 
-  /** What is posted: cameras and times of the film's frames. @param {boolean} stereo whether two eyes share its width */
-  #request(stereo = false) {
-    const { motion, transport, settings } = this.around;
-    const { width, height } = this.#size(stereo);
+  /**
+   * Build the request for a video: its cameras and frames.
+   * @param {boolean} stereo whether two eyes share the width
+   */
+  #buildRequest(stereo = false) {
+    const { motion, transport, settings } = this.context;
+    const { width, height } = this.#readSize(stereo);
     const box = { left: 0, top: 0, width, height };
-    const short = (/** @type {number} */ value) => Number(value.toFixed(6));
-    const moments = this.track.moments;
+    const round = (/** @type {number} */ value) => Number(value.toFixed(6));
+    const { moments } = this.track;
     const poses = moments.map((seconds) => {
       const pose = this.track.at(seconds);
-      const { R, T } = extrinsicsOf(motion.rig, pose);
-      const { fx, fy, cx, cy } = lensOf(box, box, pose.fov);
-      return { R: R.map(short), T: T.map(short), fx: short(fx), fy: short(fy), cx, cy };
+      const { R, T } = extrinsicsFromPose(motion.rig, pose);
+      const { fx, fy, cx, cy } = lensFromFov(box, box, pose.fov);
+      return { R: R.map(round), T: T.map(round), fx: round(fx), fy: round(fy), cx, cy };
     });
     const range = transport.state ?? { first: 0, end: 1 };
-    const times = moments.map((seconds) =>
-      this.#still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
-    );
-    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground, without: settings.without, model: settings.model, stereo_m: stereo ? EYES_M : null };
+    const fps = motion.rig.fps ?? FPS;
+    const times = moments.map((seconds) => {
+      return this.#still ? transport.shown : this.track.timeAt(seconds, fps, range);
+    });
+    return {
+      poses,
+      times,
+      fps: FPS,
+      width,
+      height,
+      mode: settings.renderedModes[settings.renderedModes.length - 1],
+      error_rule: settings.get("errorRule") || null,
+      background: settings.backgroundColour,
+      without: settings.excludedCameras,
+      model: settings.comparedModel,
+      stereo_m: stereo ? EYE_DISTANCE_M : null,
+    };
   }
 
+  /** Export the path as a video. */
   async #export() {
-    const { notices, films } = this.around;
+    const { notices, films } = this.context;
     const film = films.make(({ part, text }) => {
       byId("path-progress").value = part;
       this.progressText = text;
@@ -235,9 +314,10 @@ export class PathPanel {
     byId("path-progress").value = 0;
     this.#show();
     try {
-      const made = await film.make(this.#request(stereo));
-      if (made) download(made, stereo ? "viewmend-path_SBS.mp4" : "viewmend-path.mp4");
-      notices.toast(made ? `Video exported (${((performance.now() - film.since) / 1000).toFixed(0)} s)` : "Export cancelled");
+      const video = await film.make(this.#buildRequest(stereo));
+      if (video) download(video, stereo ? STEREO_NAME : NAME);
+      const seconds = (performance.now() - film.startedAt) / 1000;
+      notices.toast(video ? `Video exported (${seconds.toFixed(0)} s)` : "Export cancelled");
     } catch (error) {
       notices.toast(`Export failed: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
@@ -246,17 +326,21 @@ export class PathPanel {
     }
   }
 
+  /** Save the path as a file. */
   #save() {
-    const text = JSON.stringify(pathFile(this.track, this.#request()), null, 1);
+    const text = JSON.stringify(buildPathFile(this.track, this.#buildRequest()), null, 1);
     download(new Blob([text], { type: "application/json" }), "viewmend-path.json");
   }
 
+  /** Open the file that the user has chosen. */
   async #open() {
-    const { motion, transport, notices } = this.around;
+    const { motion, transport, notices } = this.context;
     const [file] = byId("path-file").files;
     if (!file || !motion.rig || !motion.goal) return;
     try {
-      const { points, recorded } = pointsOf(JSON.parse(await file.text()), motion.rig, motion.goal.fov, Math.max(0, transport.shown));
+      const content = JSON.parse(await file.text());
+      const time = Math.max(0, transport.shown);
+      const { points, recorded } = readPoints(content, motion.rig, motion.goal.fov, time);
       this.track.points = points;
       this.track.recordingSince = recorded ? 0 : -1;
       this.recording = false;
@@ -268,4 +352,18 @@ export class PathPanel {
       byId("path-file").value = "";
     }
   }
+}
+
+/**
+ * Build a button whose text is a symbol.
+ * @param {string} text
+ * @param {string} label
+ * @param {() => void} act
+ * @param {boolean} [disabled]
+ */
+function buildButton(text, label, act, disabled = false) {
+  const button = element("button", { type: "button", textContent: text, title: label, disabled });
+  button.setAttribute("aria-label", label);
+  button.addEventListener("click", act);
+  return button;
 }

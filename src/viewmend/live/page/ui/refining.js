@@ -1,36 +1,41 @@
-// Progress while a view at rest is being completed.
+// The progress bar while a view at rest is being completed.
 
 import { byId } from "./dom.js";
 
-/** Nothing is shown for views that are completed within this time. */
+/** Nothing is shown for views that are completed within this time, in milliseconds. */
 const SHOW_AFTER_MS = 300;
-/** The expected time before the first completed view. */
+/** The first view is expected to take this long, in milliseconds. */
 const FIRST_EXPECTED_MS = 2000;
-/** The share of the newest time in the expected time. */
-const NEWEST_SHARE = 0.3;
-/** The bar waits here for a view that takes longer than expected. */
+/** The weight of the last view in the expected time. */
+const NEWEST_WEIGHT = 0.3;
+/** The bar is updated at this interval, in milliseconds. */
+const UPDATE_MS = 100;
+/** The bar stops here, as a share of its length, while a view takes longer than expected. */
 const MAX_PROGRESS = 0.95;
 
 export class Refining {
   constructor() {
     this.expectedMs = FIRST_EXPECTED_MS;
-    /** When the view was requested; 0 while none is being refined. */
+    /** When the view was requested, ms; 0 while none is being completed. */
     this.since = 0;
-    setInterval(() => this.#show(), 100);
+    setInterval(() => this.#show(), UPDATE_MS);
   }
 
-  /** The view at rest was requested. */
+  /** Start the bar when a view at rest was requested. */
   begin() {
     this.since = performance.now();
   }
 
-  /** The completed view has arrived. */
+  /** Learn from the time that a view took, and hide the bar. */
   finish() {
-    if (this.since) this.expectedMs += NEWEST_SHARE * (performance.now() - this.since - this.expectedMs);
+    if (this.since) {
+      const elapsed = performance.now() - this.since;
+      this.expectedMs += NEWEST_WEIGHT * (elapsed - this.expectedMs);
+    }
     this.stop();
   }
 
-  /** The view moves or was given up. */
+  /** Hide the bar, because the view moves or was cancelled. */
   stop() {
     this.since = 0;
     this.#show();

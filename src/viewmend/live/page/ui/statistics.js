@@ -1,7 +1,8 @@
-// Figures: how fast, how late, what each stage costs, with the last frames as a small plot.
+// Statistics: frame rate, latency and the cost of each stage, with a small plot of the last frames.
 
 import { byId, element } from "./dom.js";
 
+/** The name and the colour of each stage of the server. */
 const STAGES = {
   geometry: ["Geometry", "#4fc3b1"],
   context: ["Context", "#6ea8fe"],
@@ -10,16 +11,45 @@ const STAGES = {
   encode: ["Encoding", "#a58bf0"],
   wait: ["Waiting", "#56606d"],
 };
+/** The figures: the end of each element's id, and its label. */
+const FIGURES = {
+  fps: "frames/s",
+  repaints: "repaints/s",
+  latency: "latency",
+  holes: "holes",
+  size: "resolution",
+  kb: "per frame",
+  dropped: "dropped",
+  viewers: "viewers",
+  budget: "time budget",
+  triangles: "triangles",
+  textures: "textures",
+};
+/** The plot shows this many frames. */
 const HISTORY = 120;
+/** The costs of the stages are means of this many frames. */
+const RECENT = 20;
+/** The latency is the median of this many frames. */
 const LATENCIES = 60;
+/** Rates are measured over this long, in milliseconds. */
+const RATE_MS = 2000;
+/** When a rate has more events than this, the oldest half is dropped. */
+const MAX_EVENTS = 400;
+/** The figures are updated at this interval, in milliseconds. */
+const UPDATE_MS = 500;
+/** The plot has grid lines at a multiple of one of these, in milliseconds. */
+const GRID_STEPS_MS = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
+/** The plot has at most about this many grid lines. */
+const MAX_GRID_LINES = 3.2;
 
 /** @param {number[]} values @param {number} share */
-function quantile(values, share) {
+function computeQuantile(values, share) {
+  if (!values.length) return NaN;
   const sorted = [...values].sort((a, b) => a - b);
-  return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
+  return sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))];
 }
 
-/** Times of events within the last two seconds. */
+/** The rate of events. */
 class Rate {
   constructor() {
     /** @type {number[]} */
@@ -28,32 +58,38 @@ class Rate {
 
   mark() {
     this.times.push(performance.now());
-    if (this.times.length > 400) this.times.splice(0, 200);
+    if (this.times.length > MAX_EVENTS) this.times.splice(0, MAX_EVENTS / 2);
   }
 
   get perSecond() {
-    const start = performance.now() - 2000;
-    return this.times.filter((time) => time > start).length / 2;
+    const start = performance.now() - RATE_MS;
+    return this.times.filter((time) => time > start).length / (RATE_MS / 1000);
   }
 }
 
 export class Statistics {
-  /** @param {() => boolean} active whether the view moves or plays: a frame rate means nothing at rest */
-  constructor(active) {
-    this.active = active;
-    this.pictures = new Rate();
+  /** @param {() => boolean} isActive whether the view moves or plays; at rest, a frame rate means nothing */
+  constructor(isActive) {
+    this.isActive = isActive;
+    /** Frames of the server. */
+    this.received = new Rate();
     this.repaints = new Rate();
+    /** Views that the page has drawn. */
     this.drawn = new Rate();
-    /** What the last view drawn by the page needed; null if the server draws. @type {{draws: number, triangles: number, textureBytes: number} | null} */
+    /**
+     * What the last view drawn by the page needed; null if the server draws.
+     * @type {{draws: number, triangles: number, textureBytes: number} | null}
+     */
     this.cost = null;
     /** @type {number[]} */
     this.latencies = [];
-    /** @type {Record<string, number>[]} */
+    /** Milliseconds of each stage, by frame. @type {Record<string, number>[]} */
     this.history = [];
-    /** @type {any} */
+    /** The last message "stats". @type {any} */
     this.server = null;
-    /** @type {any} */
+    /** The header of the last frame. @type {any} */
     this.header = null;
+    /** Number of the last request that was answered. */
     this.answered = 0;
     this.bytes = 0;
     /** @type {Record<string, HTMLElement>} */
@@ -61,16 +97,11 @@ export class Statistics {
     /** @type {Record<string, HTMLElement>} */
     this.stages = {};
     this.#build();
-    setInterval(() => this.#show(), 500);
+    setInterval(() => this.#show(), UPDATE_MS);
   }
 
   #build() {
-    for (const [name, text] of [
-      ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "latency"],
-      ["holes", "holes"], ["size", "resolution"], ["kb", "per frame"],
-      ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "time budget"],
-      ["triangles", "triangles"], ["textures", "textures"],
-    ]) {
+    for (const [name, text] of Object.entries(FIGURES)) {
       const value = element("dd", { id: `figure-${name}`, textContent: "–" });
       this.figures[name] = value;
       byId("figures").append(element("div", {}, element("dt", { textContent: text }), value));
@@ -84,9 +115,14 @@ export class Statistics {
     }
   }
 
-  /** A picture is on the canvas. @param {any} header @param {number} bytes @returns {number | null} pose to pixel, if it answers a new look */
-  picture(header, bytes) {
-    this.pictures.mark();
+  /**
+   * Take a frame of the server into account.
+   * @param {any} header
+   * @param {number} bytes
+   * @returns {number | null} milliseconds from the request to the image, if the frame answers a new request
+   */
+  addFrame(header, bytes) {
+    this.received.mark();
     this.header = header;
     this.bytes = bytes;
     this.history.push(header.stage_ms);
@@ -99,73 +135,103 @@ export class Statistics {
     return latency;
   }
 
-  /** The page has drawn a view, or shown one of the server's. @param {{draws: number, triangles: number, textureBytes: number} | null} cost */
-  painted(cost) {
+  /**
+   * Take a repaint into account.
+   * @param {{draws: number, triangles: number, textureBytes: number} | null} cost of a view that the page has
+   *   drawn;
+   *   null for one of the server
+   */
+  addRepaint(cost) {
     this.repaints.mark();
     this.cost = cost;
     if (cost) this.drawn.mark();
   }
 
   #show() {
-    const { cost } = this;
-    const median = quantile(this.latencies, 0.5);
-    const fps = Math.round((cost ? this.drawn : this.pictures).perSecond);
-    const late = !cost && median > 0 ? [`${median.toFixed(0)} ms`] : [];
-    byId("readout").textContent = this.active() ? [...(fps ? [`${fps} fps`] : []), ...late].join(" · ") : "";
-    if (!this.header) return;
-    if (!byId("section-stats").offsetParent) return;
-    const { figures, header, server } = this;
-    const count = (/** @type {number} */ value) => value.toLocaleString("en");
-    const put = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
+    const latency = computeQuantile(this.latencies, 0.5);
+    const fps = (this.cost ? this.drawn : this.received).perSecond;
+    this.#showReadout(fps, latency);
+    if (!this.header || !byId("section-stats").offsetParent) return;
+    this.#showFigures(fps, latency);
+    this.#showStages();
+    this.#plot();
+  }
+
+  /**
+   * Show the frame rate and the latency at the top of the page.
+   * @param {number} fps
+   * @param {number} latency ms
+   */
+  #showReadout(fps, latency) {
+    const parts = [];
+    if (Math.round(fps)) parts.push(`${Math.round(fps)} fps`);
+    if (!this.cost && latency > 0) parts.push(`${latency.toFixed(0)} ms`);
+    byId("readout").textContent = this.isActive() ? parts.join(" · ") : "";
+  }
+
+  /** @param {number} fps @param {number} latency ms */
+  #showFigures(fps, latency) {
+    const { figures, header, server, cost } = this;
+    const show = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
       figures[name].replaceChildren(value, element("small", { textContent: unit }));
     };
-    put("fps", (cost ? this.drawn : this.pictures).perSecond.toFixed(1));
-    put("triangles", cost ? count(cost.triangles) : "–");
-    put("textures", cost ? (cost.textureBytes / 1e6).toFixed(1) : "–", cost ? " MB" : "");
-    put("repaints", this.repaints.perSecond.toFixed(0));
-    put("latency", Number.isNaN(median) ? "–" : median.toFixed(0), " ms");
-    put("holes", (100 * header.holes).toFixed(1), " %");
-    put("size", `${header.width}×${header.height}`);
-    put("kb", (this.bytes / 1000).toFixed(0), " kB");
-    put("dropped", String(header.dropped));
-    put("viewers", String(server?.viewers ?? "–"));
-    put("budget", server?.budget ? server.budget.target_ms.toFixed(0) : "none", server?.budget ? " ms" : "");
-    const recent = this.history.slice(-20);
+    show("fps", fps.toFixed(1));
+    show("triangles", cost ? cost.triangles.toLocaleString("en") : "–");
+    show("textures", cost ? (cost.textureBytes / 1e6).toFixed(1) : "–", cost ? " MB" : "");
+    show("repaints", this.repaints.perSecond.toFixed(0));
+    show("latency", Number.isNaN(latency) ? "–" : latency.toFixed(0), " ms");
+    show("holes", (100 * header.holes).toFixed(1), " %");
+    show("size", `${header.width}×${header.height}`);
+    show("kb", (this.bytes / 1000).toFixed(0), " kB");
+    show("dropped", String(header.dropped));
+    show("viewers", String(server?.viewers ?? "–"));
+    show("budget", server?.budget ? server.budget.target_ms.toFixed(0) : "none", server?.budget ? " ms" : "");
+  }
+
+  /** Show the mean cost of each stage. */
+  #showStages() {
+    const recent = this.history.slice(-RECENT);
     for (const name of Object.keys(this.stages)) {
       const mean = recent.reduce((sum, stages) => sum + (stages[name] ?? 0), 0) / recent.length;
       this.stages[name].textContent = `${mean.toFixed(mean < 9.95 ? 1 : 0)} ms`;
     }
-    this.#plot();
   }
 
+  /** Plot the stages of the last frames as stacked bars. */
   #plot() {
     const canvas = byId("plot");
     const ratio = Math.min(2, window.devicePixelRatio);
-    const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
+    const width = Math.round(canvas.clientWidth * ratio);
+    const height = Math.round(canvas.clientHeight * ratio);
     canvas.width = width;
     canvas.height = height;
-    const pen = canvas.getContext("2d");
-    const sums = this.history.map((stages) => Object.keys(STAGES).reduce((sum, name) => sum + (stages[name] ?? 0), 0));
-    const top = 1.15 * Math.max(10, quantile(sums, 0.97));
+    const context = canvas.getContext("2d");
+
+    // one bar per frame
+    const names = Object.keys(STAGES);
+    const sums = this.history.map((stages) => names.reduce((sum, name) => sum + (stages[name] ?? 0), 0));
+    const top = 1.15 * Math.max(10, computeQuantile(sums, 0.97));
     const bar = width / HISTORY;
     this.history.forEach((stages, index) => {
       let y = height;
       const x = width - (this.history.length - index) * bar;
       for (const [name, [, colour]] of Object.entries(STAGES)) {
         const part = ((stages[name] ?? 0) / top) * height;
-        pen.fillStyle = colour;
-        pen.fillRect(x, y - part, Math.max(1, bar - 0.5), part);
+        context.fillStyle = colour;
+        context.fillRect(x, y - part, Math.max(1, bar - 0.5), part);
         y -= part;
       }
     });
-    const step = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((ms) => top / ms <= 3.2) ?? 10000;
-    pen.font = `${10 * ratio}px system-ui, sans-serif`;
+
+    // grid lines
+    const step = GRID_STEPS_MS.find((ms) => top / ms <= MAX_GRID_LINES) ?? 10000;
+    context.font = `${10 * ratio}px system-ui, sans-serif`;
     for (let ms = step; ms < top; ms += step) {
       const y = Math.round(height * (1 - ms / top)) + 0.5;
-      pen.fillStyle = "#8a929c40";
-      pen.fillRect(0, y, width, 1);
-      pen.fillStyle = "#8a929c";
-      if (y > 14 * ratio) pen.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
+      context.fillStyle = "#8a929c40";
+      context.fillRect(0, y, width, 1);
+      context.fillStyle = "#8a929c";
+      if (y > 14 * ratio) context.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
     }
   }
 }

@@ -2,27 +2,41 @@
 
 import { byId, setIcon, setSlider } from "./dom.js";
 
+/** The speeds of playback. */
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
-/** How long a request overrides states of the server, which may have been sent before the request arrived. */
-const HEARD_MS = 1000;
+/**
+ * A request overrides the server's states for this long, in milliseconds: they may be older than the request.
+ */
+const OVERRIDE_MS = 1000;
+/** The share of a difference from the server's clock that each repaint corrects. */
+const CORRECTION = 0.03;
+/** A difference of more frames than this, or than a third of a second, is corrected at once. */
+const MAX_DIFFERENCE = 2;
 
 export class Transport {
-  /** @param {import("../link/viewer.js").ViewerLink} link @param {number} first the frame to begin at, paused; -1 to play */
-  constructor(link, first) {
+  /**
+   * @param {import("../link/viewer.js").ViewerLink} link
+   * @param {number} initialFrame the frame to start at, paused; -1 to play
+   */
+  constructor(link, initialFrame) {
     this.link = link;
-    this.first = first;
-    /** @type {any} */
+    this.initialFrame = initialFrame;
+    /** The server's last state, with the requested changes. @type {any} */
     this.state = null;
-    /** @type {Record<string, {value: any, at: number}>} */
+    /** The requested changes. @type {Record<string, {value: any, at: number}>} */
     this.requested = {};
     this.seeking = false;
+    /** The shown frame; -1 for none. */
     this.shown = -1;
-    /** The requested frame while it is not shown yet; -1 if none. */
-    this.sought = -1;
-    /** Whether the page draws frames by itself: it pauses at the shown one, which may not be the server's. */
+    /** The requested frame while it is not shown yet; -1 for none. */
+    this.soughtFrame = -1;
+    /**
+     * Whether the page draws the frames: it then pauses at the shown frame, which may not be the server's.
+     */
     this.drawing = false;
-    /** The server's clock at a moment, and the position that follows it smoothly. */
-    this.heard = { time: 0, at: 0 };
+    /** The server's clock when its last state arrived. */
+    this.serverClock = { time: 0, at: 0 };
+    /** The position that follows it smoothly, in frames. */
     this.position = 0;
     this.positionAt = 0;
     const seek = byId("seek");
@@ -30,22 +44,22 @@ export class Transport {
       this.seeking = true;
       this.seek(Number(seek.value));
     });
-    // Not every browser fires "change" for a slider that is dragged away and back.
+    // some browsers do not fire "change" if a slider is dragged away and back
     for (const end of ["change", "pointerup"]) {
       seek.addEventListener(end, () => {
         this.seeking = false;
-        this.sought = -1;
+        this.soughtFrame = -1;
       });
     }
     byId("play").addEventListener("click", () => this.toggle());
-    byId("live").addEventListener("click", () => this.live());
-    byId("speed").addEventListener("change", () => this.speed(Number(byId("speed").value)));
+    byId("live").addEventListener("click", () => this.goLive());
+    byId("speed").addEventListener("change", () => this.setSpeed(Number(byId("speed").value)));
     link.addEventListener("state", (event) => {
       const state = /** @type {CustomEvent} */ (event).detail;
-      this.heard = { time: state.time, at: performance.now() };
-      this.#state(state);
+      this.serverClock = { time: state.time, at: performance.now() };
+      this.#setState(state);
     });
-    link.addEventListener("welcome", () => this.#again());
+    link.addEventListener("welcome", () => this.#restoreClock());
   }
 
   /** Whether playback is running. */
@@ -54,118 +68,161 @@ export class Transport {
   }
 
   /** The paused or initial frame; -1 while playing. */
-  get still() {
-    return this.first >= 0 ? this.first : this.playing || this.state.total === 1 ? -1 : Math.max(this.sought, this.shown);
+  get stillFrame() {
+    if (this.initialFrame >= 0) return this.initialFrame;
+    if (this.playing || this.state.total === 1) return -1;
+    return Math.max(this.soughtFrame, this.shown);
   }
 
+  /** Play or pause. */
   toggle() {
-    this.sought = -1;
+    this.soughtFrame = -1;
     const playing = !this.#current("playing", true);
-    this.#sendClock(playing || !this.drawing || this.shown < 0 ? { playing } : { playing, seek: this.shown });
+    const pausesAtShown = !playing && this.drawing && this.shown >= 0;
+    this.#changeClock(pausesAtShown ? { playing, seek: this.shown } : { playing });
   }
 
-  /** The frames that there are. */
+  /** The frames that are available. */
   get range() {
     return { first: this.state?.first ?? 0, end: this.state?.end ?? 0 };
   }
 
   /**
-   * The frame to draw now: the server's clock, continued between its messages.
-   * @param {number} now ms @param {number} fps of the source @returns {number} -1 if there is none
+   * Find the frame to draw now, by the server's clock, which runs on between its messages.
+   * @param {number} now ms
+   * @param {number} fps of the source
+   * @returns {number} -1 if there is none
    */
   timeAt(now, fps) {
-    const { state, heard } = this;
+    const { state } = this;
     if (!state || state.end <= state.first) return -1;
-    if (!this.playing) return this.#within(this.sought >= 0 ? this.sought : this.#current("seek", state.time));
-    if (state.kind === "live") return this.#within(state.time);
-    const [count, perMs] = [state.end - state.first, (fps * state.speed) / 1000];
-    const wrap = (/** @type {number} */ frames) => (state.end === state.total ? frames - count * Math.round(frames / count) : frames);
-    this.position += (now - this.positionAt) * perMs;
+    if (!this.playing) {
+      return this.#clampFrame(this.soughtFrame >= 0 ? this.soughtFrame : this.#current("seek", state.time));
+    }
+    if (state.kind === "live") return this.#clampFrame(state.time);
+    this.#followClock(now, fps);
+    return this.#clampFrame(Math.floor(this.position));
+  }
+
+  /**
+   * Advance the position, and correct its difference from the server's clock.
+   * @param {number} now ms
+   * @param {number} fps
+   */
+  #followClock(now, fps) {
+    const { state, serverClock } = this;
+    const count = state.end - state.first;
+    const framesPerMs = (fps * state.speed) / 1000;
+    const loops = state.end === state.total;
+    this.position += (now - this.positionAt) * framesPerMs;
     this.positionAt = now;
-    const off = wrap(heard.time + 0.5 + (now - heard.at) * perMs - this.position);
-    this.position += Math.abs(off) > Math.max(2, fps / 3) ? off : 0.03 * off;
-    if (state.end === state.total) this.position = state.first + ((((this.position - state.first) % count) + count) % count);
-    return this.#within(Math.floor(this.position));
+    const serverPosition = serverClock.time + 0.5 + (now - serverClock.at) * framesPerMs;
+    const frames = serverPosition - this.position;
+    const difference = loops ? frames - count * Math.round(frames / count) : frames;
+    const jumps = Math.abs(difference) > Math.max(MAX_DIFFERENCE, fps / 3);
+    this.position += jumps ? difference : CORRECTION * difference;
+    if (loops) {
+      const offset = this.position - state.first;
+      this.position = state.first + (((offset % count) + count) % count);
+    }
   }
 
   /** @param {number} time */
-  #within(time) {
+  #clampFrame(time) {
     return Math.min(this.state.end - 1, Math.max(this.state.first, time));
   }
 
   /** @param {number} time */
   seek(time) {
-    if (time === this.sought && this.seeking) return;
-    this.sought = time;
-    this.#sendClock({ seek: time });
+    if (time === this.soughtFrame && this.seeking) return;
+    this.soughtFrame = time;
+    this.#changeClock({ seek: time });
   }
 
   /** @param {number} time */
   pauseAt(time) {
-    this.sought = time;
-    this.#sendClock({ playing: false, seek: time });
+    this.soughtFrame = time;
+    this.#changeClock({ playing: false, seek: time });
   }
 
-  /** @param {number} frames */
+  /** Pause, and go to another frame. @param {number} frames */
   step(frames) {
     if (!this.state) return;
-    const time = this.state.playing || this.sought < 0 ? this.shown : this.sought;
-    this.pauseAt(this.#within(time + frames));
+    const time = this.state.playing || this.soughtFrame < 0 ? this.shown : this.soughtFrame;
+    this.pauseAt(this.#clampFrame(time + frames));
   }
 
-  live() {
-    this.sought = -1;
-    this.#sendClock({ live: true, speed: 1 });
+  goLive() {
+    this.soughtFrame = -1;
+    this.#changeClock({ live: true, speed: 1 });
   }
 
   /** @param {number} speed */
-  speed(speed) {
-    this.#sendClock({ speed });
+  setSpeed(speed) {
+    this.#changeClock({ speed });
   }
 
   /** @param {number} steps along the list of speeds */
-  faster(steps) {
+  changeSpeed(steps) {
     if (this.state?.kind !== "recording") return;
-    const place = SPEEDS.indexOf(this.#current("speed", 1));
-    this.speed(SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, place + steps))]);
+    const index = SPEEDS.indexOf(this.#current("speed", 1)) + steps;
+    this.setSpeed(SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, index))]);
   }
 
-  /** The last request, or the state of the server. @param {string} name @param {any} otherwise */
+  /**
+   * Get a value of the last request, or of the server's state.
+   * @param {string} name
+   * @param {any} otherwise
+   */
   #current(name, otherwise) {
     const requested = this.requested[name];
-    return requested && performance.now() - requested.at < HEARD_MS ? requested.value : (this.state?.[name] ?? otherwise);
+    if (requested && performance.now() - requested.at < OVERRIDE_MS) return requested.value;
+    return this.state?.[name] ?? otherwise;
   }
 
-  /** Send a change of the clock, and show it before the server confirms it. @param {any} clock */
-  #sendClock(clock) {
-    this.link.clock(clock);
-    const parted = clock.seek !== undefined || (clock.speed ?? 1) !== 1 || clock.playing === false;
-    const meant = { ...clock, ...(clock.live ? { playing: true } : parted ? { live: false } : {}) };
-    for (const [name, value] of Object.entries(meant)) this.requested[name] = { value, at: performance.now() };
-    if (this.state) this.#state({ ...this.state, ...meant });
+  /** Request a change of the clock, and show it before the server confirms it. @param {any} change */
+  #changeClock(change) {
+    this.link.changeClock(change);
+    const expected = { ...change };
+    const leavesLive = change.seek !== undefined || (change.speed ?? 1) !== 1 || change.playing === false;
+    if (change.live) expected.playing = true;
+    else if (leavesLive) expected.live = false;
+    for (const [name, value] of Object.entries(expected)) {
+      this.requested[name] = { value, at: performance.now() };
+    }
+    if (this.state) this.#setState({ ...this.state, ...expected });
   }
 
   /** Restore the clock after a lost connection. */
-  #again() {
+  #restoreClock() {
     const last = this.state;
-    if (last && !last.live) this.link.clock({ playing: last.playing, speed: last.speed, seek: this.shown });
+    if (!last || last.live) return;
+    this.link.changeClock({ playing: last.playing, speed: last.speed, seek: this.shown });
   }
 
-  /** @param {any} state */
-  #state(state) {
+  /** Show a state. @param {any} state */
+  #setState(state) {
     this.state = state;
     const recording = state.kind === "recording";
-    if (this.first >= 0 && state.end > Math.min(this.first, (state.total ?? Infinity) - 1)) {
-      const seek = this.first;
-      this.first = -1;
-      this.#sendClock({ playing: false, seek });
+
+    // pause at the initial frame as soon as it is available
+    const lastFrame = (state.total ?? Infinity) - 1;
+    if (this.initialFrame >= 0 && state.end > Math.min(this.initialFrame, lastFrame)) {
+      const seek = this.initialFrame;
+      this.initialFrame = -1;
+      this.#changeClock({ playing: false, seek });
       return;
     }
-    byId("transport").hidden = recording && state.total === 1; // a single frame
+
+    // slider
+    const isSingleFrame = recording && state.total === 1;
+    byId("transport").hidden = isSingleFrame;
     const seek = byId("seek");
     seek.min = state.first;
     seek.max = Math.max(state.first, (state.total ?? state.end) - 1);
     seek.disabled = state.end - state.first < 2;
+
+    // buttons
     const play = byId("play");
     play.setAttribute("aria-label", state.playing ? "Pause" : "Play");
     play.title = state.playing ? "Pause (space)" : "Play (space)";
@@ -177,13 +234,13 @@ export class Transport {
     live.title = recording ? "Rejoin the shared playback (L)" : "Jump to live (L)";
     byId("speed").disabled = !recording;
     byId("speed").value = String(state.speed);
-    this.picture(this.shown);
+    this.showFrame(this.shown);
   }
 
   /** Show the index of the displayed frame. @param {number} time */
-  picture(time) {
+  showFrame(time) {
     this.shown = time;
-    if (time === this.sought && !this.seeking) this.sought = -1;
+    if (time === this.soughtFrame && !this.seeking) this.soughtFrame = -1;
     if (!this.state || time < 0) return;
     if (!this.seeking) setSlider(byId("seek"), time);
     else setSlider(byId("seek"), Number(byId("seek").value));

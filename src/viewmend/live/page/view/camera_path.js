@@ -1,32 +1,62 @@
-// A camera path: places in time, and the smooth curve through them.
+// A camera path: poses at moments in time, and the smooth curve through them.
 
 import { clamp, wrap } from "./matrix.js";
-import { MOST_ELEVATION } from "./pose.js";
+import { MAX_ELEVATION } from "./pose.js";
 
 /** @typedef {import("./pose.js").Pose} Pose */
-/** @typedef {{pose: Pose, seconds: number, time: number}} Point `time`: the index of the frame that was shown */
+/**
+ * @typedef {{pose: Pose, seconds: number, time: number}} Point `time` is the index of the frame shown there
+ */
 
-/** Between two views that were added one by one. */
-const SECONDS_BETWEEN = 2;
-const LEAST_SECONDS = 0.1;
+/** Views that are added one by one are this many seconds apart. */
+const STEP_S = 2;
+/** Views are at least this many seconds apart. */
+const MIN_STEP_S = 0.1;
+/** A path is recorded and exported with this many poses per second. */
 export const FPS = 30;
-export const MOST_POSES = 900;
+/** A path has at most this many poses. */
+export const MAX_POSES = 900;
+/** A recorded pose is stored if this share of a pose's time has passed since the last one. */
+const RECORDED_SHARE = 0.9;
+/** A full turn has this many views besides the first. */
+const TURN_STEPS = 8;
+/** A swing to both sides has this many views besides the first. */
+const SWING_STEPS = 16;
+/** The positions of angles in the numbers of a pose; see `numbersFromPose`. */
+const ANGLES = [3, 5];
 
-/** @param {Pose} pose */
-const numbers = (pose) => [...pose.target, pose.azimuth, pose.elevation, pose.roll, Math.log(pose.distance), pose.fov];
+/** Convert a pose to numbers that can be interpolated. @param {Pose} pose */
+function numbersFromPose({ target, azimuth, elevation, roll, distance, fov }) {
+  return [...target, azimuth, elevation, roll, Math.log(distance), fov];
+}
 
-/** A curve through two high views would pass above the pole and tip over. @param {number[]} values @returns {Pose} */
-const poseFrom = ([x, y, z, azimuth, elevation, roll, logDistance, fov]) => ({
-  target: [x, y, z], azimuth, elevation: clamp(elevation, -MOST_ELEVATION, MOST_ELEVATION), roll, distance: Math.exp(logDistance), fov,
-});
+/**
+ * Convert numbers to a pose. The elevation is limited, because a curve through two high views would pass
+ * above the pole and tip over.
+ * @param {number[]} numbers
+ * @returns {Pose}
+ */
+function poseFromNumbers([x, y, z, azimuth, elevation, roll, logDistance, fov]) {
+  return {
+    target: [x, y, z],
+    azimuth,
+    elevation: clamp(elevation, -MAX_ELEVATION, MAX_ELEVATION),
+    roll,
+    distance: Math.exp(logDistance),
+    fov,
+  };
+}
 
+/** A camera path that is recorded, or made of views that are added one by one. */
 export class Track {
   constructor() {
     /** @type {Point[]} */
     this.points = [];
+    /** When the recording began, ms; -1 if views were added one by one. */
     this.recordingSince = -1;
   }
 
+  /** The length of the path. */
   get seconds() {
     return this.points.at(-1)?.seconds ?? 0;
   }
@@ -36,47 +66,68 @@ export class Track {
     this.recordingSince = -1;
   }
 
-  /** When a view that is added now would be passed. */
-  get #next() {
-    return this.points.length ? this.seconds + SECONDS_BETWEEN : 0;
+  /** The moment of a view that is added now, in seconds. */
+  get #nextSeconds() {
+    return this.points.length ? this.seconds + STEP_S : 0;
   }
 
-  /** Whether one more view has room. */
+  /** Whether there is room for one more view. */
   get room() {
-    return this.#next * FPS < MOST_POSES;
-  }
-
-  /** @param {Pose} pose @param {number} time */
-  add(pose, time) {
-    if (this.room) this.points.push({ pose: { ...pose }, seconds: this.#next, time });
+    return this.#nextSeconds * FPS < MAX_POSES;
   }
 
   /**
-   * Around the target: a whole turn, or a swing there and back about where the view is.
-   * @param {Pose} pose @param {number} arc degrees @param {number} seconds @param {number} time
+   * Add a view at the end.
+   * @param {Pose} pose
+   * @param {number} time
+   */
+  add(pose, time) {
+    if (this.room) this.points.push({ pose: { ...pose }, seconds: this.#nextSeconds, time });
+  }
+
+  /**
+   * Replace the path by a full turn around the target, or by a swing to both sides of the pose and back.
+   * @param {Pose} pose
+   * @param {number} arc degrees
+   * @param {number} seconds
+   * @param {number} time
    */
   turntable(pose, arc, seconds, time) {
     this.clear();
-    const whole = arc >= 360;
-    const steps = whole ? 8 : 16;
+    const fullTurn = arc >= 360;
+    const steps = fullTurn ? TURN_STEPS : SWING_STEPS;
     this.points = Array.from({ length: steps + 1 }, (_, step) => {
-      const turn = whole ? (360 * step) / steps : (arc / 2) * Math.sin((2 * Math.PI * step) / steps);
+      const turn = fullTurn ? (360 * step) / steps : (arc / 2) * Math.sin((2 * Math.PI * step) / steps);
       return { pose: { ...pose, azimuth: pose.azimuth + turn }, seconds: (seconds * step) / steps, time };
     });
   }
 
-  /** Swap a view with the next or the one before; the moments stay. @param {number} index @param {number} steps */
+  /**
+   * Swap a view with the next or the previous one; their moments stay.
+   * @param {number} index
+   * @param {number} steps
+   */
   move(index, steps) {
-    const [one, other] = [this.points[index], this.points[index + steps]];
-    if (one && other) [one.pose, other.pose] = [other.pose, one.pose];
+    const point = this.points[index];
+    const other = this.points[index + steps];
+    if (!point || !other) return;
+    const { pose } = point;
+    point.pose = other.pose;
+    other.pose = pose;
   }
 
-  /** Set when a view is passed, after the one before; the later ones keep their distance. @param {number} index @param {number} seconds */
+  /**
+   * Move a view in time, at most to the previous one; the later ones keep their distance from it.
+   * @param {number} index
+   * @param {number} seconds
+   */
   retime(index, seconds) {
     if (index <= 0 || !Number.isFinite(seconds)) return;
-    const last = (MOST_POSES - 1) / FPS - (this.seconds - this.points[index].seconds);
-    const moved = clamp(seconds, this.points[index - 1].seconds + LEAST_SECONDS, last) - this.points[index].seconds;
-    for (const point of this.points.slice(index)) point.seconds += moved;
+    const current = this.points[index].seconds;
+    const earliest = this.points[index - 1].seconds + MIN_STEP_S;
+    const latest = (MAX_POSES - 1) / FPS - (this.seconds - current);
+    const shift = clamp(seconds, earliest, latest) - current;
+    for (const point of this.points.slice(index)) point.seconds += shift;
   }
 
   /** @param {number} index */
@@ -86,63 +137,90 @@ export class Track {
     for (const point of this.points) point.seconds -= first;
   }
 
-  /** @param {number} now ms */
+  /** Start a recording. @param {number} now ms */
   start(now) {
     this.clear();
     this.recordingSince = now;
   }
 
-  /** @param {Pose} pose @param {number} time @param {number} now ms @returns {boolean} whether there is room for more */
+  /**
+   * @param {Pose} pose
+   * @param {number} time
+   * @param {number} now ms
+   * @returns {boolean} whether there is room for more
+   */
   record(pose, time, now) {
     const seconds = (now - this.recordingSince) / 1000;
-    if (seconds * FPS >= MOST_POSES - 1) return false;
-    if (!this.points.length || seconds - this.seconds >= 0.9 / FPS) this.points.push({ pose: { ...pose }, seconds, time });
+    if (seconds * FPS >= MAX_POSES - 1) return false;
+    const due = !this.points.length || seconds - this.seconds >= RECORDED_SHARE / FPS;
+    if (due) this.points.push({ pose: { ...pose }, seconds, time });
     return true;
   }
 
   /**
-   * The pose at a moment: a Catmull-Rom curve through the points, angles the short way round.
-   * @param {number} seconds @returns {Pose}
+   * Compute the pose at a moment: a Catmull-Rom curve through the points, with angles the short way round.
+   * @param {number} seconds
+   * @returns {Pose}
    */
   at(seconds) {
     const { points } = this;
     const next = points.findIndex((point) => point.seconds > seconds);
     if (next <= 0) return (next === 0 ? points[0] : points[points.length - 1]).pose;
-    const here = numbers(points[next - 1].pose);
-    const turns = (/** @type {number[]} */ values) =>
-      values.map((value, i) => (i === 3 || i === 5 ? here[i] + wrap(value - here[i]) : value));
-    const [p0, p2, p3] = [next - 2, next, next + 1].map((i) => points[Math.min(points.length - 1, Math.max(0, i))]);
+
+    // the two points around the moment, p1 and p2, and their neighbours
+    const pointAt = (/** @type {number} */ i) => points[clamp(i, 0, points.length - 1)];
+    const p0 = pointAt(next - 2);
     const p1 = points[next - 1];
-    const [v0, v2, v3] = [p0, p2, p3].map((point) => turns(numbers(point.pose)));
+    const p2 = pointAt(next);
+    const p3 = pointAt(next + 1);
+
+    // their numbers, with angles within half a turn of those of p1
+    const v1 = numbersFromPose(p1.pose);
+    const unwrap = (/** @type {Point} */ { pose }) => {
+      return numbersFromPose(pose).map((value, i) => {
+        return ANGLES.includes(i) ? v1[i] + wrap(value - v1[i]) : value;
+      });
+    };
+    const v0 = unwrap(p0);
+    const v2 = unwrap(p2);
+    const v3 = unwrap(p3);
+
+    // the cubic Hermite polynomial
     const span = p2.seconds - p1.seconds;
+    const span1 = Math.max(1e-6, p2.seconds - p0.seconds);
+    const span2 = Math.max(1e-6, p3.seconds - p1.seconds);
     const s = (seconds - p1.seconds) / span;
-    const slope = (/** @type {number} */ a, /** @type {number} */ b, /** @type {Point} */ from, /** @type {Point} */ to) =>
-      (span * (b - a)) / Math.max(1e-6, to.seconds - from.seconds);
-    return poseFrom(
-      here.map((value, i) => {
-        const [m1, m2] = [slope(v0[i], v2[i], p0, p2), slope(value, v3[i], p1, p3)];
-        const [s2, s3] = [s * s, s * s * s];
-        return (2 * s3 - 3 * s2 + 1) * value + (s3 - 2 * s2 + s) * m1 + (3 * s2 - 2 * s3) * v2[i] + (s3 - s2) * m2;
-      }),
-    );
+    const s2 = s * s;
+    const s3 = s * s * s;
+    const values = v1.map((value, i) => {
+      const slope1 = (span * (v2[i] - v0[i])) / span1;
+      const slope2 = (span * (v3[i] - value)) / span2;
+      const start = (2 * s3 - 3 * s2 + 1) * value + (s3 - 2 * s2 + s) * slope1;
+      return start + (3 * s2 - 2 * s3) * v2[i] + (s3 - s2) * slope2;
+    });
+    return poseFromNumbers(values);
   }
 
   /**
-   * The frame's index at a moment: as it was shown while recording, running along between views that were added.
-   * @param {number} seconds @param {number} fps of the source @param {{first: number, end: number}} range
+   * Find the index of the frame at a moment: the one that was shown while recording. If views were added one
+   * by one, time runs on from the first of them.
+   * @param {number} seconds
+   * @param {number} fps of the source
+   * @param {{first: number, end: number}} range
    */
   timeAt(seconds, fps, { first, end }) {
     const next = this.points.findIndex((point) => point.seconds > seconds);
     const point = this.points[(next < 0 ? this.points.length : Math.max(1, next)) - 1];
-    const along = this.recordingSince >= 0 ? 0 : Math.floor((seconds - this.points[0].seconds) * fps + 1e-6);
-    const start = this.recordingSince >= 0 ? point.time : this.points[0].time;
+    const recorded = this.recordingSince >= 0;
+    const passed = recorded ? 0 : Math.floor((seconds - this.points[0].seconds) * fps + 1e-6);
+    const start = recorded ? point.time : this.points[0].time;
     const count = Math.max(1, end - first);
-    return first + ((((start + along - first) % count) + count) % count);
+    return first + ((((start + passed - first) % count) + count) % count);
   }
 
-  /** Moments of a film of this path. @returns {number[]} seconds */
+  /** The moments of a video of this path. @returns {number[]} seconds */
   get moments() {
-    const count = Math.min(MOST_POSES, Math.floor(this.seconds * FPS + 1e-6) + 1);
+    const count = Math.min(MAX_POSES, Math.floor(this.seconds * FPS + 1e-6) + 1);
     return Array.from({ length: count }, (_, i) => i / FPS);
   }
 }

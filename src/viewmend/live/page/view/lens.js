@@ -1,4 +1,4 @@
-// From a field of view of the free part of the page to a camera of the whole picture.
+// Lenses: from the field of view of the free part of the page to the intrinsics of the whole image.
 
 import { degrees, radians } from "./matrix.js";
 
@@ -14,20 +14,36 @@ import { degrees, radians } from "./matrix.js";
  * @property {number} height
  */
 
-/** What a field of view is measured along. @param {{width: number, height: number}} free */
-const sideOf = ({ width, height }) => Math.min(height, 1.45 * width);
-
-/** The field of view of a focal length in pixels, degrees. @param {{width: number, height: number}} free @param {number} f */
-export const fovOf = (free, f) => degrees(2 * Math.atan(sideOf(free) / 2 / f));
+/** In a narrow box, the field of view is measured along its width times this factor. */
+const NARROW_ASPECT = 1.45;
+/** The width and height of a request are multiples of this, in pixels. */
+const SIZE_STEP = 4;
+/** The width and height of a request are at least this, in pixels. */
+const MIN_SIZE = 16;
 
 /**
- * The lens in CSS pixels of the picture's box: its axis passes through the middle of what nothing covers.
- * In a box that is higher than wide the field of view is that of a square, as far as it goes.
- * @param {Box} box where the picture is @param {Box} free the part that no panel covers @param {number} fov degrees
+ * Compute the length that a field of view is measured along.
+ * @param {{width: number, height: number}} free
+ */
+const measureSide = ({ width, height }) => Math.min(height, NARROW_ASPECT * width);
+
+/**
+ * The field of view of a focal length in pixels, degrees.
+ * @param {{width: number, height: number}} free
+ * @param {number} f
+ */
+export const fovFromFocal = (free, f) => degrees(2 * Math.atan(measureSide(free) / 2 / f));
+
+/**
+ * Compute the lens in CSS pixels of the image's box. Its axis passes through the middle of the free part. In
+ * a narrow box, the horizontal field of view is kept instead of the vertical one.
+ * @param {Box} box of the image
+ * @param {Box} free the part that no panel covers
+ * @param {number} fov degrees
  * @returns {Lens}
  */
-export function lensOf(box, free, fov) {
-  const f = sideOf(free) / 2 / Math.tan(radians(fov) / 2);
+export function lensFromFov(box, free, fov) {
+  const f = measureSide(free) / 2 / Math.tan(radians(fov) / 2);
   return {
     fx: f,
     fy: f,
@@ -38,28 +54,57 @@ export function lensOf(box, free, fov) {
   };
 }
 
-/** The same view in another number of pixels. @param {Lens} lens @param {number} width @param {number} height @returns {Lens} */
-export function resize(lens, width, height) {
-  const [x, y] = [width / lens.width, height / lens.height];
-  return { fx: lens.fx * x, fy: lens.fy * y, cx: lens.cx * x, cy: lens.cy * y, width, height };
+/**
+ * The same view in another number of pixels.
+ * @param {Lens} lens
+ * @param {number} width
+ * @param {number} height
+ * @returns {Lens}
+ */
+export function resizeLens(lens, width, height) {
+  const scaleX = width / lens.width;
+  const scaleY = height / lens.height;
+  return {
+    fx: lens.fx * scaleX,
+    fy: lens.fy * scaleY,
+    cx: lens.cx * scaleX,
+    cy: lens.cy * scaleY,
+    width,
+    height,
+  };
 }
 
 /**
- * How many pixels to ask for: as many as a square of `side`, in the box's shape, within the server's limits.
- * @param {Box} box @param {number} side @param {{max_side_px: number, max_pixels: number}} limits
+ * Choose the image size of a request: as many pixels as a square of `side`, in the box's shape, within the
+ * limits.
+ * @param {Box} box
+ * @param {number} side
+ * @param {{max_side_px: number, max_pixels: number}} limits of the server
  */
-export function sizeFor(box, side, limits) {
+export function chooseSize(box, side, limits) {
   const shape = Math.sqrt(box.width / box.height);
-  const pixels = Math.min(1, Math.sqrt(limits.max_pixels) / side, limits.max_side_px / (side * Math.max(shape, 1 / shape)));
-  const even = (/** @type {number} */ value) => Math.max(16, 4 * Math.floor((value * pixels) / 4 + 1e-6));
-  return { width: even(side * shape), height: even(side / shape) };
+  const longSide = side * Math.max(shape, 1 / shape);
+  const shrink = Math.min(1, Math.sqrt(limits.max_pixels) / side, limits.max_side_px / longSide);
+  const round = (/** @type {number} */ value) => {
+    return Math.max(MIN_SIZE, SIZE_STEP * Math.floor((value * shrink) / SIZE_STEP + 1e-6));
+  };
+  return { width: round(side * shape), height: round(side / shape) };
 }
 
-/** The `side` of a picture that has a pixel for each of the display's. @param {Box} box @param {number} ratio of pixels to CSS pixels */
-export const sharpSide = (box, ratio) => Math.sqrt(box.width * box.height) * ratio;
+/**
+ * Compute the `side` of an image with one pixel for each pixel of the display.
+ * @param {Box} box
+ * @param {number} ratio of pixels to CSS pixels
+ */
+export const computeSharpSide = (box, ratio) => Math.sqrt(box.width * box.height) * ratio;
 
-/** The largest box of a shape within another one. @param {Box} outer @param {number} aspect width by height @returns {Box} */
-export function contained(outer, aspect) {
+/**
+ * The largest box of a shape within another one.
+ * @param {Box} outer
+ * @param {number} aspect width by height
+ * @returns {Box}
+ */
+export function fitBox(outer, aspect) {
   const width = Math.min(outer.width, outer.height * aspect);
   const height = width / aspect;
   return {

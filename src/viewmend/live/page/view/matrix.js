@@ -1,4 +1,4 @@
-// Small vectors and 3 x 3 matrices (nine numbers, row by row).
+// Vectors of three numbers, and 3 x 3 matrices of nine, row by row.
 
 /** @typedef {number[]} Vec3 */
 /** @typedef {number[]} Mat3 */
@@ -16,7 +16,11 @@ export const scale = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 /** @param {Vec3} a @param {Vec3} b @returns {Vec3} */
-export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const cross = (a, b) => [
+  a[1] * b[2] - a[2] * b[1],
+  a[2] * b[0] - a[0] * b[2],
+  a[0] * b[1] - a[1] * b[0],
+];
 
 /** @param {Vec3} a */
 export const length = (a) => Math.hypot(a[0], a[1], a[2]);
@@ -42,7 +46,11 @@ export function multiply(a, b) {
   return out;
 }
 
-/** The inverse of [fx s cx; 0 fy cy; 0 0 1]. @param {Mat3} K @returns {Mat3} */
+/**
+ * Invert [fx s cx; 0 fy cy; 0 0 1].
+ * @param {Mat3} K
+ * @returns {Mat3}
+ */
 export function invertIntrinsics(K) {
   const [fx, s, cx, , fy, cy] = K;
   return [1 / fx, -s / (fx * fy), (s * cy - cx * fy) / (fx * fy), 0, 1 / fy, -cy / fy, 0, 0, 1];
@@ -57,5 +65,5 @@ export const radians = (degrees) => (degrees * Math.PI) / 180;
 /** @param {number} angle */
 export const degrees = (angle) => (angle * 180) / Math.PI;
 
-/** The same angle within half a turn of zero. @param {number} angle degrees */
+/** Bring an angle within half a turn of zero. @param {number} angle degrees */
 export const wrap = (angle) => angle - 360 * Math.round(angle / 360);

@@ -1,30 +1,49 @@
-// The view in the URL, so that links and reloads show the same.
+// Keeps the view in the URL, so that links and reloads show the same view.
 
-import { MOST_ELEVATION } from "./pose.js";
+import { MAX_ELEVATION } from "./pose.js";
 
 /** @typedef {import("./pose.js").Pose} Pose */
 
-/** Browsers limit URL changes to about three per second. */
-const GAP_MS = 400;
+/**
+ * The URL is changed at most once in this time, in milliseconds; browsers allow about three changes per
+ * second.
+ */
+const MIN_INTERVAL_MS = 400;
+/** A pose consists of this many numbers. */
+const POSE_NUMBERS = 8;
+/** The distances that a pose may have, in metres. */
+const DISTANCES = { min: 0.02, max: 1000 };
+/** The fields of view that a pose may have, in degrees. */
+const FOVS = { min: 2, max: 150 };
+/** No coordinate of a target is larger than this, in metres. */
+const MAX_COORDINATE = 1e4;
 
 /** @param {Pose} pose @returns {string} azimuth, elevation, roll, distance, field of view, target */
-export function poseText({ azimuth, elevation, roll, distance, fov, target }) {
-  return [azimuth, elevation, roll, distance, fov, ...target].map((value) => Number(value.toFixed(4))).join(",");
+export function formatPose({ azimuth, elevation, roll, distance, fov, target }) {
+  const numbers = [azimuth, elevation, roll, distance, fov, ...target];
+  return numbers.map((value) => Number(value.toFixed(4))).join(",");
 }
 
-/** @param {string | null} text what `poseText` gives @returns {Pose | null} */
-export function poseOf(text) {
+/** @param {string | null} text result of `formatPose` @returns {Pose | null} null if the text is no pose */
+export function parsePose(text) {
   const numbers = (text ?? "").split(",").map(Number);
   const [azimuth, elevation, roll, distance, fov, ...target] = numbers;
-  const good = numbers.length === 8 && numbers.every(Number.isFinite) && Math.abs(elevation) <= MOST_ELEVATION;
-  if (!good || distance < 0.02 || distance > 1000 || fov < 2 || fov > 150 || target.some((value) => Math.abs(value) > 1e4)) return null;
+  if (numbers.length !== POSE_NUMBERS || !numbers.every(Number.isFinite)) return null;
+  const valid =
+    Math.abs(elevation) <= MAX_ELEVATION &&
+    distance >= DISTANCES.min &&
+    distance <= DISTANCES.max &&
+    fov >= FOVS.min &&
+    fov <= FOVS.max &&
+    target.every((value) => Math.abs(value) <= MAX_COORDINATE);
+  if (!valid) return null;
   return { azimuth, elevation, roll, distance, fov, target };
 }
 
-/** @param {string | null} text @returns {number} a frame's index; -1 for none */
-export const timeOf = (text) => (/^\d{1,9}$/.test(text ?? "") ? Number(text) : -1);
+/** @param {string | null} text @returns {number} the index of a frame; -1 if the text is none */
+export const parseFrameIndex = (text) => (/^\d{1,9}$/.test(text ?? "") ? Number(text) : -1);
 
-/** Writes the view to the URL once it rests. */
+/** Writes the view to the URL, at a limited rate. */
 export class UrlState {
   /** @param {"search" | "hash"} part of the URL that holds it */
   constructor(part) {
@@ -34,14 +53,17 @@ export class UrlState {
     this.query = {};
   }
 
-  /** @param {Record<string, string | null>} query parameters by name; null omits one */
+  /**
+   * Write parameters soon.
+   * @param {Record<string, string | null>} query parameters by name; null removes one
+   */
   update(query) {
     this.query = query;
-    this.timer ||= window.setTimeout(() => this.#write(), GAP_MS);
+    this.timer ||= window.setTimeout(() => this.#write(), MIN_INTERVAL_MS);
   }
 
-  /** The address of what is shown. */
-  link() {
+  /** Write the view to the URL now, and return the URL. */
+  getLink() {
     this.#write();
     return location.href;
   }
