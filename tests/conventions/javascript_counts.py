@@ -22,6 +22,12 @@ TOKEN = re.compile(
 DECLARATION = re.compile(r"\b(?:const|let|var)\b")
 CONDITIONAL = re.compile(r"\?(?![.?])(?<!\?\?)")
 """The question mark of `a ? b : c`, not that of `?.` or `??`."""
+FUNCTION = re.compile(
+    r"^(?:export )?(?:(?:async )?function\b|class\b|const \w+ = (?:async )?\([^()]*\) =>)", re.MULTILINE
+)
+"""The beginning of a function or class at the top level; its parameters contain no brackets."""
+CONSTANT = re.compile(r"^(?:export )?const [A-Z][A-Z0-9_]* =", re.MULTILINE)
+"""The beginning of a constant at the top level."""
 OPENING = "([{"
 CLOSING = ")]}"
 COLUMNS = {
@@ -30,6 +36,7 @@ COLUMNS = {
     "declarations": "declarations of several names in one statement",
     "statements": "lines with several statements",
     "nested": "conditional operators within another one",
+    "late_constants": "files with constants after the first function or class",
     "long_lines": f"lines over {MAX_COLUMNS} columns",
 }
 """The counts, and what each counts."""
@@ -45,6 +52,7 @@ def count_file(source: str) -> Counter[str]:
         declarations=sum(declares_several(code, match.end()) for match in DECLARATION.finditer(code)),
         statements=sum(has_several_statements(line) for line in code.splitlines()),
         nested=count_nested(code),
+        late_constants=has_late_constants(code),
         long_lines=sum(len(line) > MAX_COLUMNS for line in lines),
     )
 
@@ -141,6 +149,12 @@ def count_nested(code: str) -> int:
     return found
 
 
+def has_late_constants(code: str) -> int:
+    """Whether a constant follows the first function or class, as a number."""
+    definition = FUNCTION.search(code)
+    return int(definition is not None and CONSTANT.search(code, definition.end()) is not None)
+
+
 def count_folders(page: Path) -> dict[str, Counter[str]]:
     """The counts of each folder of the page; files next to the folders count as 'top level'."""
     counts: dict[str, Counter[str]] = {}
@@ -158,7 +172,7 @@ def format_table(counts: dict[str, Counter[str]]) -> str:
     rows += [
         (name, *(str(found[key]) for key in COLUMNS)) for name, found in {**counts, "total": total}.items()
     ]
-    return "\n".join("".join(f"{cell:>14}" for cell in row) for row in rows)
+    return "\n".join("".join(f"{cell:>16}" for cell in row) for row in rows)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,8 @@ def test_scripts_stay_easy_to_read():
         ("statements", "if (a) { b(); c(); }", "const a = () => { b(); };"),
         ("nested", "a ? b : c ? d : e;", "f(a ? b : c, d ? e : g);"),
         ("nested", "a ? (b) : c?.d ? e : f;", "a ? b?.c ?? d : e;"),
+        ("late_constants", "function f() {}\nconst A = 1;", "const A = 1;\nfunction f() {}"),
+        ("late_constants", "const f = (a) => a;\nconst A = 1;", "const A = (1);\nconst f = () => 1;"),
         ("long_lines", "a = " + "1" * 107, "a = " + "1" * 106),
     ],
 )

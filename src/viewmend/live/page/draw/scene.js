@@ -69,6 +69,17 @@ const DEPTH_ONLY = `#version 300 es
 precision mediump float;
 void main() {}`;
 
+/** Multiplies an image by its mask, so that bilinear samples weigh each pixel by its mask. */
+const CUT_OUT = `#version 300 es
+precision highp float;
+uniform sampler2D image, mask;
+out vec4 colour;
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  float inside = texelFetch(mask, at, 0).r;
+  colour = vec4(texelFetch(image, at, 0).rgb * inside, inside);
+}`;
+
 /**
  * Write the shader that blends the images of cameras. GLSL requires constant sampler indices, so each number
  * of images has a shader of its own.
@@ -155,17 +166,6 @@ ${Array.from(
   vec3 seen = sum.rgb / max(sum.a, 1e-6);
   if (known < minWeight) colour = vec4(mix(tint, hole.rgb, hole.a), hole.a);
   else colour = vec4(cuts ? mix(background, seen, min(1.0, sum.a / total)) : seen, 1.0);
-}`;
-
-/** Multiplies an image by its mask, so that bilinear samples weigh each pixel by its mask. */
-const CUT_OUT = `#version 300 es
-precision highp float;
-uniform sampler2D image, mask;
-out vec4 colour;
-void main() {
-  ivec2 at = ivec2(gl_FragCoord.xy);
-  float inside = texelFetch(mask, at, 0).r;
-  colour = vec4(texelFetch(image, at, 0).rgb * inside, inside);
 }`;
 
 /**

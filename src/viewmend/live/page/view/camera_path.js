@@ -22,7 +22,7 @@ const RECORDED_SHARE = 0.9;
 const TURN_STEPS = 8;
 /** A swing to both sides has this many views besides the first. */
 const SWING_STEPS = 16;
-/** The positions of angles in the numbers of a pose; see `numbersFromPose`. */
+/** The indices of azimuth and roll in the numbers of a pose; see `numbersFromPose`. */
 const ANGLES = [3, 5];
 
 /** Convert a pose to numbers that can be interpolated. @param {Pose} pose */

@@ -49,11 +49,11 @@ function invertExtrinsics({ R, T }) {
  * @returns {{points: Point[], recorded: boolean}}
  */
 export function readPoints(content, rig, fov, time) {
-  // the views that the path was made of
+  // prefer the views that the path was made of
   const views = Array.isArray(content?.points) ? content.points.map(readPoint) : [];
   const recorded = views.length ? content.recorded === true : true;
 
-  // or its matrices
+  // otherwise, take its matrices
   const matrices = Array.isArray(content) ? content : content?.world_from_camera;
   if (!views.length && !(Array.isArray(matrices) && matrices.length)) {
     throw new Error(

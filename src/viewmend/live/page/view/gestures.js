@@ -5,7 +5,7 @@
 const DEGREES_PER_HEIGHT = 200;
 /** A pixel of the wheel multiplies the distance by e to the power of this. */
 const ZOOM_PER_PIXEL = 0.0012;
-/** As much, for pinching on a touchpad, which browsers report as a wheel with the control key. */
+/** The same for pinching on a touchpad, which browsers report as a wheel with the control key. */
 const PINCH_PER_PIXEL = 0.01;
 /** The pixels of a WheelEvent's unit, by its `deltaMode`: pixels, lines and pages. */
 const PIXELS_PER_UNIT = [1, 16, 400];
@@ -32,7 +32,7 @@ export function listenToGestures(surface, motion, focal, wake, focus) {
       motion.mode === "fly" ? 180 / Math.PI / focal() : DEGREES_PER_HEIGHT / surface.clientHeight;
     motion.turn(dx * degreesPerPixel, dy * degreesPerPixel);
   };
-  /** The middle and the distance of two fingers. */
+  /** Measure the middle and the distance of two fingers. */
   const measurePinch = () => {
     const [a, b] = pointers.values();
     return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, width: Math.hypot(a.x - b.x, a.y - b.y) };

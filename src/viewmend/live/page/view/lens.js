@@ -1,4 +1,4 @@
-// Lenses: from the field of view of the free part of the page to the intrinsics of the whole image.
+// Conversion of the field of view of the free part of the page to the intrinsics of the whole image.
 
 import { degrees, radians } from "./matrix.js";
 
@@ -28,7 +28,7 @@ const MIN_SIZE = 16;
 const measureSide = ({ width, height }) => Math.min(height, NARROW_ASPECT * width);
 
 /**
- * The field of view of a focal length in pixels, degrees.
+ * Compute the field of view of a focal length in pixels, in degrees.
  * @param {{width: number, height: number}} free
  * @param {number} f
  */
@@ -55,7 +55,7 @@ export function lensFromFov(box, free, fov) {
 }
 
 /**
- * The same view in another number of pixels.
+ * Scale a lens to another image size.
  * @param {Lens} lens
  * @param {number} width
  * @param {number} height
@@ -99,7 +99,7 @@ export function chooseSize(box, side, limits) {
 export const computeSharpSide = (box, ratio) => Math.sqrt(box.width * box.height) * ratio;
 
 /**
- * The largest box of a shape within another one.
+ * Fit the largest box with an aspect ratio into another box.
  * @param {Box} outer
  * @param {number} aspect width by height
  * @returns {Box}

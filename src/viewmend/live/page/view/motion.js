@@ -1,4 +1,4 @@
-// How the view moves: mouse, touch and keys set a goal, and the pose follows it smoothly.
+// The movement of the view: mouse, touch and keys set a goal, and the pose follows it smoothly.
 
 import { add, clamp, scale, sub } from "./matrix.js";
 import {

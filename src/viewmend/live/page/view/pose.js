@@ -1,4 +1,5 @@
-// Poses of the viewer, as angles about a target, and their conversion to cameras (OpenCV axes, metres).
+// Poses of the viewer, as angles about a target, and their conversion to and from cameras (OpenCV axes,
+// metres).
 
 import {
   add,
@@ -60,7 +61,7 @@ export function directionToEye(basis, pose) {
 }
 
 /**
- * Right, down and forward of a camera in the world.
+ * Compute the directions right, down and forward of a camera in the world.
  * @param {Basis} basis
  * @param {Pose} pose
  */
@@ -145,7 +146,7 @@ export function interpolatePoses(from, to, part) {
 }
 
 /**
- * Whether the difference is invisible.
+ * Whether the difference between two poses is invisible.
  * @param {Pose} a
  * @param {Pose} b
  */
