@@ -69,7 +69,7 @@ assets.open({ assets: "" });
 const options = { playing: false, framesPerMs: 0, live: false };
 const arrived = ({ shape, images }) => shape && images.size === shape.header.cameras.length;
 while (!(assets.frames.has(0) && arrived(assets.frames.get(0)))) {
-  assets.want(0, [0, 0, 9], { first: 0, end: 1 }, options);
+  assets.request(0, [0, 0, 9], { first: 0, end: 1 }, options);
   await new Promise((resolve) => setTimeout(resolve, 20));
 }
 const whole = assets.frames.get(0);
@@ -87,7 +87,8 @@ const paint = (viewer, frame) => {
 };
 window.drawView = (viewer, virtual, times) => {
   const frame = virtual ? whole : real;
-  [canvas.width, canvas.height] = [viewer.lens.width, viewer.lens.height];
+  canvas.width = viewer.lens.width;
+  canvas.height = viewer.lens.height;
   paint(viewer, frame);
   const picture = canvas.toDataURL("image/png");
   const start = performance.now();
@@ -263,7 +264,7 @@ def draw(
 
 
 def closest(cameras: Cameras, target: Cameras, center: Float[Tensor, "3"]) -> list[int]:
-    """Numbers of the cameras that the page colours a view from, as `sourcesOf` in link/assets.js chooses them."""
+    """Numbers of the cameras that the page colours a view from, as `chooseCameras` in link/assets.js does."""
     to_cameras = F.normalize(cameras.centers - center, dim=1)
     to_eye = F.normalize(target.centers[0] - center, dim=0)
     return (to_cameras @ to_eye).argsort(descending=True, stable=True)[:COMPLETED_SOURCES].tolist()
