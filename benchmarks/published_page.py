@@ -12,7 +12,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -99,9 +99,10 @@ def served(folder: Path, line: Line) -> Iterator[str]:
                 super().do_GET()
 
         def copyfile(self, source: Any, outputfile: Any) -> None:
-            while block := source.read(BLOCK_BYTES):
-                line.send(len(block))
-                outputfile.write(block)
+            with suppress(ConnectionError):  # the page was closed while it loaded the rest
+                while block := source.read(BLOCK_BYTES):
+                    line.send(len(block))
+                    outputfile.write(block)
 
         def log_message(self, format: str, *values: Any) -> None:
             """Log nothing."""

@@ -46,11 +46,14 @@ def _glibc() -> ctypes.CDLL | None:
     return library
 
 
-def configure_allocator() -> bool:
-    """Set the allocator's options and oneDNN's, before threads are started and images processed; True on success."""
+def configure_allocator(large_bytes: int = LARGE_BYTES) -> bool:
+    """Set the allocator's options and oneDNN's, before threads are started and images processed; True on success.
+
+    Buffers of more than `large_bytes` are mapped separately.
+    """
     os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", str(KERNELS))
     library = _glibc()
-    options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, TOP_BYTES))
+    options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, large_bytes), (_M_TRIM_THRESHOLD, TOP_BYTES))
     return library is not None and all(library.mallopt(*option) == 1 for option in options)
 
 
