@@ -23,9 +23,11 @@ CONFIG = FusionConfig(resolution=48)
 
 
 @pytest.fixture(params=["numba", "torch"])
-def fuse(request):
-    """Each of the two fast paths."""
-    return fusion._fuse_numba if request.param == "numba" else fusion._fuse_torch
+def fuse(request, monkeypatch):
+    """`fuse_occupancy` by each of the two fast paths; returns the values."""
+    if request.param == "torch":
+        monkeypatch.setattr(fusion, "_sums_numba", fusion._sums_torch)
+    return lambda *arguments: fuse_occupancy(*arguments).values
 
 
 def bowl(points):
@@ -63,7 +65,7 @@ def test_both_paths_equal_the_slow_reference(fuse, rng):
         [*(ring(3, 40)[[n]] for n in range(3)), ABOVE[[0]], camera_at(10, "near", 30)]
     )
     mask = (255 * (proxy.depth(cameras) > 0)).byte()
-    config = FusionConfig(resolution=14, confidence_power=1.5)
+    config = FusionConfig(resolution=14)
     hull = visual_hull(mask, cameras, BOX, replace(fusion.HullConfig(), resolution=14))
     exact = true_views(proxy, cameras)
     views = replace(
@@ -136,3 +138,40 @@ def test_an_empty_grid_stays_empty(fuse):
     image = torch.zeros(2, 48, 48)
     assert not fuse(grid, DepthViews(cameras, image, image), CONFIG).any()
     assert fuse_occupancy(grid, DepthViews(cameras, image, image), CONFIG).values.shape == (4, 5, 6)
+
+
+def test_a_surface_of_uncertain_depth_is_smoothed(rng):
+    proxy = proxy_of(lambda points: 0.5 - points.norm(dim=-1))
+    cameras = ring(8, 96)
+    exact = true_views(proxy, cameras)
+    noise = 0.03 * torch.randn(exact.depth.shape, generator=rng) * (exact.depth > 0)
+
+    def roughness(confidence: float, config: FusionConfig) -> float:
+        views = DepthViews(cameras, exact.depth + noise, torch.full_like(exact.depth, confidence))
+        _, fused = carved(proxy, cameras, views, config)
+        return float((fused.mesh.vertices.norm(dim=-1) - 0.5).std())
+
+    light = replace(CONFIG, hull_weight=1e-3)
+    sharp = replace(light, smooth_below=-2.0, sharp_above=-1.0)
+    assert roughness(0.1, light) < 0.5 * roughness(0.1, sharp)
+    assert roughness(0.9, light) == roughness(0.9, sharp)
+
+
+def test_uncertain_depth_moves_the_hull_less_than_certain_depth():
+    proxy = proxy_of(lambda points: 0.5 - points.norm(dim=-1))
+    cameras = ring(8, 96)
+    exact = true_views(proxy, cameras)
+    too_deep = (exact.depth + 0.1) * (exact.depth > 0)
+
+    def removed_m3(confidence: float) -> float:
+        views = DepthViews(cameras, too_deep, torch.full_like(exact.depth, confidence))
+        hull, fused = carved(proxy, cameras, views)
+        return volume(hull.mesh) - volume(fused.mesh)
+
+    assert removed_m3(0.02) < 0.5 * removed_m3(1.0)
+
+
+@pytest.mark.parametrize("wrong", [{"hull_weight": 0.0}, {"smooth_below": 0.5}])
+def test_a_config_without_meaning_is_refused(wrong):
+    with pytest.raises(ValueError, match="expected"):
+        FusionConfig(**wrong)

@@ -1,21 +1,47 @@
 """Slow, obvious reference of viewmend.geometry.fusion.fuse_occupancy: one voxel, one view at a time."""
 
+import itertools
+
 import numpy as np
 
 
 def fuse_reference(hull, views, config):
     """The fused occupancy of a grid, float64."""
     values = hull.values.numpy()
-    fused = np.zeros(values.shape)
+    sums = np.zeros((*values.shape, 3))
     for index in np.ndindex(*values.shape):
         if values[index] > 0:
             point = hull.low.double().numpy() + (np.array(index) + 0.5) * hull.voxel_m
-            fused[index] = min(values[index], left_by_views(point, hull.voxel_m, views, config))
+            sums[index] = sums_at(point, hull.voxel_m, views, config)
+
+    fused = np.zeros(values.shape)
+    for index in np.ndindex(*values.shape):
+        if values[index] > 0:
+            distance, confidence = smoothed(sums, index, config)
+            hull_distance = 1 - 2 * values[index]
+            mean = (distance + config.hull_weight * hull_distance) / (confidence + config.hull_weight)
+            fused[index] = min(values[index], max(0.0, 0.5 - 0.5 * mean))
     return fused
 
 
-def left_by_views(point, voxel_m, views, config):
-    """The occupancy that the views leave at a point in the hull."""
+def smoothed(sums, index, config):
+    """The sums of weighted distances and of confidence at a voxel, mixed with the means around it."""
+    distance, confidence, count = sums[index]
+    if not count:
+        return distance, confidence
+    around = np.zeros(2)
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        at = np.array(index) + step
+        if (at >= 0).all() and (at < sums.shape[:3]).all():
+            around += sums[tuple(at)][:2] / 27
+    mean_confidence = confidence / count
+    sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
+    sharp = min(1.0, max(0.0, sharp))
+    return sharp * np.array([distance, confidence]) + (1 - sharp) * around
+
+
+def sums_at(point, voxel_m, views, config):
+    """The sum of weighted distances, the sum of confidence, and the number of views at a point in the hull."""
     distances = []
     weights = []
     for view in range(len(views.cameras)):
@@ -28,10 +54,5 @@ def left_by_views(point, voxel_m, views, config):
             distance = (surface - z) / voxel_m
             if surface > 0 and distance > -config.truncation_voxels:
                 distances.append(min(distance, config.truncation_voxels))
-                weights.append(
-                    max(float(views.confidence[view, row, column]), 1e-3) ** config.confidence_power
-                )
-
-    if not weights:
-        return 1.0
-    return min(1.0, max(0.0, 0.5 - 0.5 * np.average(distances, weights=weights)))
+                weights.append(max(float(views.confidence[view, row, column]), 1e-3))
+    return np.dot(distances, weights), sum(weights), len(weights)

@@ -6,19 +6,23 @@ from viewmend.utils.compiled import kernel
 
 
 @kernel
-def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, voxel_m, truncation_voxels, out):
-    """Fuse the voxels of one slab along x into `out`, where the hull's occupancy is not 0."""
+def sum_distances(slab, occupancy, P, size_px, low, depth, confidence, voxel_m, truncation_voxels, sums):
+    """Add up what the views say about the voxels of one slab along x, where the hull's occupancy is not 0.
+
+    `sums` gets three numbers for each voxel: the sum of the distances, weighted by the confidence; the
+    sum of the confidence; and the number of views.
+    """
     views = P.shape[0]
     x = low[0] + (slab + 0.5) * voxel_m
     for j in range(occupancy.shape[1]):
         y = low[1] + (j + 0.5) * voxel_m
         for k in range(occupancy.shape[2]):
-            hull = occupancy[slab, j, k]
-            if hull <= 0:
+            if occupancy[slab, j, k] <= 0:
                 continue
             z = low[2] + (k + 0.5) * voxel_m
-            total = 0.0
             summed = 0.0
+            total = 0.0
+            count = 0
             for view in range(views):
                 p = P[view]
                 ahead = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
@@ -36,10 +40,10 @@ def fuse_slab(slab, occupancy, P, size_px, low, depth, weight, voxel_m, truncati
                     continue
                 distance = (surface - ahead) / voxel_m
                 if distance > -truncation_voxels:
-                    total += weight[view, row, column]
-                    summed += weight[view, row, column] * min(distance, truncation_voxels)
-
-            fused = hull
-            if total > 0:
-                fused = min(fused, max(0.0, 0.5 - 0.5 * summed / total))
-            out[slab, j, k] = fused
+                    weight = confidence[view, row, column]
+                    summed += weight * min(distance, truncation_voxels)
+                    total += weight
+                    count += 1
+            sums[0, slab, j, k] = summed
+            sums[1, slab, j, k] = total
+            sums[2, slab, j, k] = count

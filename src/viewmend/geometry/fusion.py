@@ -2,7 +2,9 @@
 
 A hull cannot be concave, and with few cameras it is too large. Depth maps are fused as in Curless
 and Levoy (SIGGRAPH 1996): every voxel takes the weighted mean of its signed distances to the
-surfaces that the views see. What no view says anything about stays as the hull has it.
+surfaces that the views see. The hull counts as one view more. So what no view says anything about
+stays as the hull has it, and depth that is uncertain moves the surface less. Where all depth is
+uncertain, distances are averaged over neighbouring voxels as well, since the surface would be rough.
 """
 
 from dataclasses import dataclass
@@ -11,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.hull import HullConfig, OccupancyGrid, kernel_arrays, visual_hull
@@ -52,8 +55,20 @@ class FusionConfig:
     """Distance in front of a surface, in voxels, from which a voxel counts as empty,
     whatever its distance. Voxels that are farther than this behind the surface that a view
     sees are hidden from it."""
-    confidence_power: float = 1.0
-    """Exponent of the confidence in a depth's weight."""
+    hull_weight: float = 1.0
+    """The hull counts as a view with this confidence. Other views have up to 1."""
+    smooth_below: float = 0.2
+    """Where the views' mean confidence is lower, the surface is smoothed."""
+    sharp_above: float = 0.35
+    """Where the views' mean confidence is higher, the surface is not smoothed."""
+
+    def __post_init__(self) -> None:
+        if not self.hull_weight > 0:
+            raise ValueError(f"expected a hull_weight above 0, got {self.hull_weight}")
+        if not self.smooth_below < self.sharp_above:
+            raise ValueError(
+                f"expected smooth_below to be less than sharp_above, got {self.smooth_below} and {self.sharp_above}"
+            )
 
 
 @dataclass(frozen=True)
@@ -101,43 +116,61 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     its camera, truncated in front and weighted by the confidence. Behind the truncation,
     the view says nothing.
     """
-    fuse = _fuse_numba if hull.values.device.type == "cpu" else _fuse_torch
-    return OccupancyGrid(fuse(hull, views, config), hull.low, hull.voxel_m)
+    add_up = _sums_numba if hull.values.device.type == "cpu" else _sums_torch
+    summed, total, count = add_up(hull, views, config)
+
+    # smooth what is uncertain
+    mean_confidence = total / count.clamp_min(1)
+    sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
+    sharp = sharp.clamp(0, 1).masked_fill(count == 0, 1.0)
+    sums = torch.stack([summed, total])
+    summed, total = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(sums, sharp)
+
+    # add the hull: its occupancy is that of its own distance in voxels
+    summed += config.hull_weight * (1 - 2 * hull.values)
+    total += config.hull_weight
+    occupancy = 0.5 - 0.5 * summed / total
+    return OccupancyGrid(torch.minimum(hull.values, occupancy.clamp_min(0)), hull.low, hull.voxel_m)
 
 
-def _fuse_numba(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "x y z"]:
-    """The fused occupancy, by compiled loops on all threads."""
-    from viewmend.geometry._fusion_numba import fuse_slab
+def _sums_numba(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "3 x y z"]:
+    """What the views say about each voxel of the hull, by compiled loops on all threads.
+
+    The sum of the distances in voxels, weighted by the confidence; the sum of the confidence; and the number of views.
+    """
+    from viewmend.geometry._fusion_numba import sum_distances
 
     occupancy = hull.values.contiguous().numpy()
-    out = np.zeros_like(occupancy)
+    sums = np.zeros((3, *occupancy.shape), occupancy.dtype)
     P, _, size_px, low = kernel_arrays(views.cameras, hull.cubes)
-    weight = views.confidence.float().clamp_min(LEAST_CONFIDENCE) ** config.confidence_power
-    images = [image.float().contiguous().numpy() for image in (views.depth, weight)]
+    depth = views.depth.float().contiguous().numpy()
+    confidence = views.confidence.float().clamp_min(LEAST_CONFIDENCE).contiguous().numpy()
 
     def work(slab: int) -> None:
-        fuse_slab(slab, occupancy, P, size_px, low, *images, hull.voxel_m, config.truncation_voxels, out)
+        sum_distances(
+            slab, occupancy, P, size_px, low, depth, confidence, hull.voxel_m, config.truncation_voxels, sums
+        )
 
     parallel_for(work, occupancy.shape[0])
-    return torch.from_numpy(out)
+    return torch.from_numpy(sums)
 
 
-def _fuse_torch(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "x y z"]:
-    """The fused occupancy, on any device."""
+def _sums_torch(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "3 x y z"]:
+    """What `_sums_numba` returns, on any device."""
     occupancy = hull.values.flatten()
     filled = (occupancy > 0).nonzero()[:, 0]
     centers = hull.cubes.centers(occupancy.device)[filled]
-    parts = [_fuse_points(points, hull.voxel_m, views, config) for points in centers.split(VOXELS_AT_ONCE)]
-    out = torch.zeros_like(occupancy)
+    parts = [_sums_at(points, hull.voxel_m, views, config) for points in centers.split(VOXELS_AT_ONCE)]
+    sums = occupancy.new_zeros(3, len(occupancy))
     if parts:
-        out[filled] = torch.minimum(occupancy[filled], torch.cat(parts))
-    return out.view(hull.values.shape)
+        sums[:, filled] = torch.cat(parts, 1)
+    return sums.view(3, *hull.values.shape)
 
 
-def _fuse_points(
+def _sums_at(
     points: Float[Tensor, "point 3"], voxel_m: float, views: DepthViews, config: FusionConfig
-) -> Float[Tensor, "point"]:
-    """The occupancy that the views leave at points in the hull."""
+) -> Float[Tensor, "3 point"]:
+    """What the views say about points in the hull."""
     cameras = views.cameras
     uv, z = project(points, cameras)
     sees = in_view(uv, z, cameras)
@@ -149,10 +182,9 @@ def _fuse_points(
     depth = views.depth[view, pixel[..., 1], pixel[..., 0]]
     confidence = views.confidence[view, pixel[..., 1], pixel[..., 0]]
 
-    # The mean signed distance to the surfaces, in voxels
+    # The signed distances to the surfaces, in voxels
     distance = (depth - z) / voxel_m
     is_used = sees & (depth > 0) & (distance > -config.truncation_voxels)
-    weight = confidence.clamp_min(LEAST_CONFIDENCE) ** config.confidence_power * is_used
-    total = weight.sum(0)
-    mean = (weight * distance.clamp(max=config.truncation_voxels)).sum(0) / total.clamp_min(1e-12)
-    return torch.where(total > 0, (0.5 - 0.5 * mean).clamp(0, 1), 1.0)
+    weight = confidence.clamp_min(LEAST_CONFIDENCE) * is_used
+    summed = (weight * distance.clamp(max=config.truncation_voxels)).sum(0)
+    return torch.stack([summed, weight.sum(0), is_used.sum(0).to(weight)])
