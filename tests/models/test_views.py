@@ -233,7 +233,7 @@ def test_pyramids_of_a_frame_are_computed_once_for_all_views(scene, monkeypatch)
 
 @torch.no_grad()
 def test_holes_are_mostly_the_ray_fill(scene, small_views):
-    """Not if they were guessed from their surroundings, for a model that predicts a part of E only."""
+    """Not if they were filled from their surroundings, for a model that predicts a part of E only."""
     stream, view, _ = scene
     net = ViewSynthNet(replace(small_views, coarse_fill="rays")).eval()
     left = torch.arange(view.mask.shape[1]) < 48
@@ -241,14 +241,14 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
     holes, where = holed.holes, view.error > 0
     assert int(holes.sum()) > 100
     sources = SourceCameras.of(stream.cached_frame().context(holed.closest_views(4)), holed.silhouettes)
-    guess = net.coarse_guess(holed, sources)
-    assert torch.equal(guess, net.coarse(replace(holed, error=holes.float()), sources))
-    own = image_of(net(holed, sources, guess=guess, where=where), view)
+    filled = net.fill_holes(holed, sources)
+    assert torch.equal(filled, net.coarse(replace(holed, error=holes.float()), sources))
+    own = image_of(net(holed, sources, filled=filled, where=where), view)
     found = net.step(holed, context_of(stream), State())[0]
-    wanted = torch.where(holes, torch.minimum(0.7 * guess + 0.3 * own, found.alpha), own)
+    wanted = torch.where(holes, torch.minimum(0.7 * filled + 0.3 * own, found.alpha), own)
     torch.testing.assert_close(found.rgb[:, where], wanted[:, where], atol=1e-4, rtol=0)
-    guess = net.coarse_guess(holed, sources, quick=True)
-    own = image_of(net(holed, sources, guess=guess, where=where), view)
+    filled = net.fill_holes(holed, sources, quick=True)
+    own = image_of(net(holed, sources, filled=filled, where=where), view)
     found = net.step(holed, context_of(stream, RenderQuality(refine_fraction=0.5)), State())[0].rgb
     torch.testing.assert_close(found[:, where], own[:, where], atol=1e-4, rtol=0)
 

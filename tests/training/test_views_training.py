@@ -248,7 +248,7 @@ def test_visible_cameras_see_the_true_surface(view):
     assert int(behind.sum()) < 0.3 * int(seen.sum())
 
 
-def test_holes_are_guessed_by_the_ray_fill_of_another_model(stored, tmp_path):
+def test_holes_are_filled_by_the_ray_fill_of_another_model(stored, tmp_path):
     """It fills the whole view, not its crops, and is not trained."""
     options = replace(OPTIONS, model=replace(VIEWS_MODEL, num_views=8, coarse_fill="rays"))
     net, rays = initial_model(options, "float32"), load_network("rays")
@@ -260,14 +260,14 @@ def test_holes_are_guessed_by_the_ray_fill_of_another_model(stored, tmp_path):
     sample = stored.sample(0, VIEWS_RENDER, 4)
     view = TrainingView.of(sample, net)
     holes = view.view.holes
-    assert int(holes.sum()) > 30 and torch.equal(view.guess[:, ~holes], view.view.rgb[:, ~holes])
+    assert int(holes.sum()) > 30 and torch.equal(view.filled[:, ~holes], view.view.rgb[:, ~holes])
     expected = rays(replace(view.view, error=holes.float()), view.sources)
-    torch.testing.assert_close(view.guess, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(view.filled, expected, atol=1e-5, rtol=0)
     torch.manual_seed(3)
     crop = random_crop(view)
-    height, width = crop.guess.shape[1:]
-    parts = view.guess.unfold(1, height, 1).unfold(2, width, 1)
-    assert bool((parts == crop.guess[:, None, None]).all(-1).all(-1).all(0).any())
+    height, width = crop.filled.shape[1:]
+    parts = view.filled.unfold(1, height, 1).unfold(2, width, 1)
+    assert bool((parts == crop.filled[:, None, None]).all(-1).all(-1).all(0).any())
     save_inpainter(ViewSynthNet(VIEWS_MODEL), tmp_path, "")
     with pytest.raises(ValueError, match="expected a model with a ray fill"):
         initial_model(replace(options, coarse_from=str(tmp_path)), "float32")
@@ -410,24 +410,24 @@ def test_a_number_always_gives_the_same_views(view_shards):
     assert any(not torch.equal(a.truth, b.truth) for a, b in zip(first, third, strict=True))
 
 
-def test_some_holes_are_guessed_from_their_surroundings_only(view_shards):
+def test_some_holes_are_filled_from_their_surroundings_only(view_shards):
     """As at run time with a small budget; colours do not depend on it."""
     net = ViewSynthNet(replace(VIEWS_MODEL, coarse_fill="rays"))
 
-    def guesses(smooth):
-        scenes = training_views(view_shards, "0", net, smooth_guess=smooth)
+    def fills(smooth):
+        scenes = training_views(view_shards, "0", net, smooth_fill=smooth)
         return [own for number in range(1, 4) for own in scenes.scene(number)]
 
-    by_net, smooth, mixed = guesses(0.0), guesses(1.0), guesses(0.5)
+    by_net, smooth, mixed = fills(0.0), fills(1.0), fills(0.5)
     assert all(torch.equal(a.truth, b.truth) for a, b in zip(by_net, smooth, strict=True))
     kinds = set()
     for a, b, own in zip(by_net, smooth, mixed, strict=True):
         holes = a.view.holes
-        assert torch.equal(a.guess[:, ~holes], b.guess[:, ~holes])
+        assert torch.equal(a.filled[:, ~holes], b.filled[:, ~holes])
         if bool(holes.any()):
-            assert torch.equal(b.guess, fill(b.view.rgb, holes, b.view.mask > 0))
-            assert not torch.equal(a.guess, b.guess)
-            kinds.add(torch.equal(own.guess, b.guess))
+            assert torch.equal(b.filled, fill(b.view.rgb, holes, b.view.mask > 0))
+            assert not torch.equal(a.filled, b.filled)
+            kinds.add(torch.equal(own.filled, b.filled))
     assert kinds == {True, False}
 
 

@@ -164,26 +164,27 @@ class ExportedModel(nn.Module):
         view = inputs.view
         sources = PackedSources.of_inputs(inputs)
         where = view.refine_mask & (rim_depth(view.depth) > 0)
-        guess = self._guess(view, sources)
-        prediction = self.net(view, sources, where=where, guess=guess)
-        fill = None if self.net.coarse is None else guess
-        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill, keep_islands=True)
+        filled = self._fill_holes(view, sources)
+        prediction = self.net(view, sources, where=where, filled=filled)
+        ray_fill = None if self.net.coarse is None else filled
+        faded = torch.zeros_like(where)
+        completed = prediction.composite_into(view, where, faded, ray_fill, keep_islands=True)
         assert completed.confidence is not None, "the model predicts it"
         return tuple(
             ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth)
         )
 
-    def _guess(self, view: IncompleteView, sources: "PackedSources") -> Float[Tensor, "3 height width"]:
-        """`ViewSynthNet.coarse_guess`."""
-        guess = fill_any_size(view.rgb, view.holes, view.mask > 0)
+    def _fill_holes(self, view: IncompleteView, sources: "PackedSources") -> Float[Tensor, "3 height width"]:
+        """The image of `ViewSynthNet.fill_holes`."""
+        smooth = fill_any_size(view.rgb, view.holes, view.mask > 0)
         if self.net.coarse is None:
-            return guess
+            return smooth
         holes = view.holes & (view.depth > 0).any()
         first = torch.arange(holes.numel()).view(holes.shape) == 0
         pixels = torch.nonzero(holes | first)  # some layers need at least one
         holed = replace(view, error=view.holes.to(view.error))
-        colours = self.net.coarse.mix(gather_ray_inputs(holed, sources, pixels, guess))
-        return torch.where(holes, scatter_to_image(colours, pixels, holes.shape), guess)
+        colours = self.net.coarse.mix(gather_ray_inputs(holed, sources, pixels, smooth))
+        return torch.where(holes, scatter_to_image(colours, pixels, holes.shape), smooth)
 
 
 @dataclass(frozen=True)

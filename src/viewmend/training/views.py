@@ -67,8 +67,8 @@ SPARSE = 0.3
 """This fraction of the crops has some pixels that are not predicted."""
 RECOLOURED = 0.7
 """This fraction of the views has changed colours."""
-SMOOTH_GUESS = 0.3
-"""This fraction of the views has holes that are guessed from their surroundings only."""
+SMOOTH_FILL = 0.3
+"""This fraction of the views has holes that are filled from their surroundings only."""
 MIN_GAIN = 0.6
 """Smallest factor by which changed colours are darkened."""
 WRONG_DIFFERENCE = 0.08
@@ -151,8 +151,8 @@ class TrainingView:
     view: IncompleteView
     sources: SourceCameras
     scale: SceneScale
-    guess: Image
-    """`ViewSynthNet.coarse_guess` of the whole view."""
+    filled: Image
+    """The image with holes filled by `ViewSynthNet.fill_holes`."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, on black."""
     alpha: UInt8[Tensor, "height width"]
@@ -161,8 +161,8 @@ class TrainingView:
     """True z-depth in metres, 0 where there is no surface; None if unavailable."""
 
     @classmethod
-    def of(cls, sample: Sample, net: ViewSynthNet, smooth_guess: bool = False) -> "TrainingView":
-        """The view of a sample with alpha and `ray_views`; holes are guessed by `net`, or from their surroundings."""
+    def of(cls, sample: Sample, net: ViewSynthNet, smooth_fill: bool = False) -> "TrainingView":
+        """The view of a sample with alpha and `ray_views`; holes are filled by `net`, or from their surroundings."""
         assert sample.ray_views and sample.alpha is not None, "stored scenes have both"
         view = sample.view
         truth = sample.truth
@@ -175,13 +175,15 @@ class TrainingView:
         truth = crop.of_image(truth).contiguous()
         alpha = crop.of_image(alpha).contiguous()
         depth = None if depth is None else crop.of_image(depth).contiguous()
-        return cls(view, sources, scale, net.coarse_guess(view, sources, smooth_guess), truth, alpha, depth)
+        return cls(view, sources, scale, net.fill_holes(view, sources, smooth_fill), truth, alpha, depth)
 
     def cropped(self, crop: Crop) -> "TrainingView":
         """A part of the view, with the same cameras."""
-        guess, truth, alpha = (crop.of_image(image) for image in (self.guess, self.truth, self.alpha))
+        filled, truth, alpha = (crop.of_image(image) for image in (self.filled, self.truth, self.alpha))
         depth = None if self.depth is None else crop.of_image(self.depth)
-        return replace(self, view=crop.of_view(self.view), guess=guess, truth=truth, alpha=alpha, depth=depth)
+        return replace(
+            self, view=crop.of_view(self.view), filled=filled, truth=truth, alpha=alpha, depth=depth
+        )
 
     @property
     def wrong(self) -> Mask:
@@ -197,15 +199,15 @@ class TrainingViews:
     scenes: SceneSource[Sample]
     seed: str
     net: ViewSynthNet
-    smooth_guess: float = SMOOTH_GUESS
-    """Fraction of views whose holes are guessed without `net`."""
+    smooth_fill: float = SMOOTH_FILL
+    """Fraction of views whose holes are filled without `net`."""
 
     def scene(self, number: int) -> list[TrainingView]:
         """The views of scene `number` with a large enough subject."""
-        random, guesses = (Random(f"{self.seed}/{kind}/{number}") for kind in ("colours", "guesses"))
+        random, fills = (Random(f"{self.seed}/{kind}/{number}") for kind in ("colours", "guesses"))
         samples = [s for s in self.scenes.scene(number) if int((s.view.mask > 0).sum()) >= MIN_SUBJECT_PX]
         samples = [recolour(s, random) if random.random() < RECOLOURED else s for s in samples]
-        return [TrainingView.of(s, self.net, guesses.random() < self.smooth_guess) for s in samples]
+        return [TrainingView.of(s, self.net, fills.random() < self.smooth_fill) for s in samples]
 
 
 def recolour(sample: Sample, random: Random) -> Sample:
@@ -296,7 +298,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
 
     def _loss(self, crop: TrainingView) -> StepOutput:
         """The loss of one crop. Its `image.outside` is the L1 of all pixels."""
-        made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.guess)
+        made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.filled)
         rows, columns = made.pixels.unbind(1)
         weights = self.weights
         truth = crop.truth / 255
@@ -379,7 +381,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
         alpha = F.avg_pool2d(crop.alpha[None] / 255, CELL_PX, ceil_mode=True)[0][cells]
         z = nearest_depth(true_depth)[cells]
         offsets = z.new_tensor(OFFSETS)
-        offset = (z - distribution.depth[cells]) / crop.scale.size_m
+        offset = (z - distribution.proxy_depth[cells]) / crop.scale.size_m
         known = (z > 0) & (alpha > 0.5) & (offset > offsets[0] - VISIBLE) & (offset < offsets[-1] + 0.1)
 
         # Cross-entropy with the truth, which is shared between the two nearest hypotheses
@@ -496,7 +498,7 @@ class ViewsValidation:
                 StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation"
             )
             net = initial_model(self.options, self.config.precision)
-            source = TrainingViews(samples, "validation", net, smooth_guess=0.0)
+            source = TrainingViews(samples, "validation", net, smooth_fill=0.0)
             views = (view for number in count() for view in source.scene(number))
             self._views = list(islice(views, self.config.validation_views))
         device = next(model.parameters()).device
@@ -506,7 +508,7 @@ class ViewsValidation:
             own = to_device(own, device)
             view = own.view
             truth = own.truth / 255
-            made = model(view, own.sources, own.scale, guess=own.guess)
+            made = model(view, own.sources, own.scale, filled=own.filled)
             rgb = scatter_to_image(made.rgb, made.pixels, view.mask.shape)
             subject = own.alpha > 127
             holes = (view.mask > 0) & (view.weights.sum(0) == 0)

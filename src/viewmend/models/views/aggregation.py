@@ -1,5 +1,6 @@
 """Aggregates what the source cameras show of each ray sample, and scores whether the surface is there."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -27,6 +28,11 @@ class AggregatedSamples(NamedTuple):
     """Evidence that the surface is at the sample."""
     trust: Float[Tensor, "ray sample view"]
     """Weights of the cameras; the sum is 1, or 0 where none has the sample in view."""
+
+    @classmethod
+    def cat(cls, parts: Sequence["AggregatedSamples"]) -> "AggregatedSamples":
+        """All rays of these parts."""
+        return cls(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 class SampleAggregator(nn.Module):

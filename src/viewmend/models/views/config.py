@@ -8,7 +8,7 @@ from msgspec import Meta
 from viewmend.utils.untrusted_input import typed
 
 OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.19, 0.26, 0.36, 0.5)
-"""The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes."""
+"""The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes (`SceneScale.size_m`)."""
 RAY_VIEWS = 4
 """A ray is sampled in this many of the source cameras: those near the viewer that see the proxy's surface."""
 FEATURES = 18
@@ -70,7 +70,7 @@ class ViewsConfig(Sizes):
     error_features: Annotated[int, Meta(ge=0, le=1024)] = 0
     """Channels of the `ErrorPredictor`; 0 for a model without one."""
     coarse_fill: Literal["smooth", "rays"] = "smooth"
-    """First guess for holes: a smooth fill, or a trained `RayFill` whose weights stay fixed."""
+    """How holes are filled before the prediction: smoothly, or by a trained `RayFill` whose weights stay fixed."""
 
 
 @dataclass(frozen=True, kw_only=True)

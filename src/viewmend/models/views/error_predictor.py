@@ -41,7 +41,7 @@ is at least this, pixels."""
 
 def fallback_view(
     view: IncompleteView,
-    fades: Bool[Tensor, "height width"],
+    faded: Bool[Tensor, "height width"],
     fill: Float[Tensor, "3 height width"] | None = None,
 ) -> CompletedView:
     """The view without a prediction: background is attenuated, and holes get `fill` with a confidence of 0."""
@@ -54,8 +54,8 @@ def fallback_view(
     E = view.error
     return CompletedView(
         view,
-        rgb=blend(view.rgb, E, rgb, (fades | filled).to(E)),
-        alpha=torch.where(fades, (1 - E) * view.mask, view.mask),
+        rgb=blend(view.rgb, E, rgb, (faded | filled).to(E)),
+        alpha=torch.where(faded, (1 - E) * view.mask, view.mask),
         confidence=torch.where(filled, (1 - E) * view.mask, view.mask),
         depth=view.depth,
     )

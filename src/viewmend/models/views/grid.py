@@ -17,21 +17,23 @@ from viewmend.utils.cancellation import stop_if_cancelled
 Pixels = Int[Tensor, "pixel 2"]
 """Row and column of pixels."""
 CELL_PX = 2
-"""Depth hypotheses are judged in square cells of this side, pixels."""
+"""The depth hypotheses are those of square cells with this side, pixels."""
 TILE_PX = 32
-"""The tiles of `run_tiled` have this side, pixels; it is a multiple of a cell's."""
+"""The tiles of `run_tiled` have this side, pixels, which is a multiple of `CELL_PX`."""
 TILES_AT_ONCE = (8, 4, 2, 1)
-"""Tiles pass the layers in groups of these sizes. They are few, because convolutions are compiled for each."""
+"""The layers run on this many tiles at a time. There are few such sizes, because convolutions are compiled for each."""
 BAND_PX = (3, 7)
-"""The bands of detail are separated by means over squares of these sides, in pixels, in a view that
-shows the subject as large as the source cameras do."""
+"""Means over squares of these sides, pixels, separate the bands of detail. The sides are those for a view
+that shows the subject as large as the source cameras do; see `band_sides_px`."""
 MAX_MAGNIFICATION = 8.0
 """The squares grow with a view's magnification up to this factor."""
 LARGE_CELLS_FROM = 3.0
-"""Views of at least this magnification have cells of twice the side. In small ones, the depths of neighbours differ by
-chance, because the source cameras show less than a pixel of theirs, and the view shows this as specks."""
+"""Views of at least this magnification have cells of twice the side. There, a normal cell is smaller than a pixel
+of the source cameras: the depths of neighbouring cells would differ by chance, which shows as specks."""
 WIDTH_STEP = 16
 """The U-Net adds this many channels at each coarser scale."""
+MIN_COVERAGE = 1e-6
+"""A cell is covered if its mean mask is above this share."""
 
 
 def downsample2x(view: IncompleteView) -> IncompleteView:
@@ -44,13 +46,14 @@ def downsample2x(view: IncompleteView) -> IncompleteView:
     below = height % 2
     padded = view.camera.cropped(0, 0, width + right, height + below)
     camera = padded.resized((width + 1) // 2, (height + 1) // 2)
-    covered = F.pad(view.mask, (0, right, 0, below))[None]
-    share = F.avg_pool2d(covered, 2).clamp(min=1e-6)
+    pixel_mask = F.pad(view.mask, (0, right, 0, below))[None]
+    share = F.avg_pool2d(pixel_mask, 2)
 
     def mean(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
-        return F.avg_pool2d(F.pad(images, (0, right, 0, below)) * covered, 2) / share
+        total = F.avg_pool2d(F.pad(images, (0, right, 0, below)) * pixel_mask, 2)
+        return total / share.clamp(min=MIN_COVERAGE)
 
-    mask = (share[0] > 1e-6).to(covered)
+    mask = (share[0] > MIN_COVERAGE).to(view.mask)
     return replace(
         view,
         camera=camera,
@@ -76,7 +79,7 @@ def upsample2x(
 
 
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
-    """The smallest depth in each cell, metres, of the pixels that have one; 0 where none has."""
+    """The smallest depth of the pixels in each cell, metres; pixels of depth 0 have none. 0 if no pixel has one."""
     height, width = depth.shape
     far = F.pad(torch.where(depth > 0, depth, BEYOND_M), (0, width % 2, 0, height % 2), value=BEYOND_M)
     nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
@@ -84,7 +87,7 @@ def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows c
 
 
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
-    """The mean of each cell, or of the part of it that the image has."""
+    """The mean of each cell; of a cell that reaches beyond the image, the mean of the part inside."""
     height, width = image.shape[1:]
     whole_cells = F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate")
     return F.avg_pool2d(whole_cells, CELL_PX)[0]
@@ -93,7 +96,7 @@ def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "c
 def scatter_to_image(
     values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
 ) -> Shaped[Tensor, "channel rows columns"]:
-    """An image of this shape with the values at rows and columns, zeros elsewhere."""
+    """An image of this shape with the values `at` these rows and columns, and zeros elsewhere."""
     image = values.new_zeros(shape[0] * shape[1], values.shape[1])
     image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values)
     return image.view(*shape, -1).permute(2, 0, 1)
@@ -106,9 +109,10 @@ def detail_bands(
     shape: torch.Size,
     magnification: float | Float[Tensor, ""] = 1.0,
 ) -> Float[Tensor, "pixel band image 3"]:
-    """The detail of some images around their own local means: a band for each of `BAND_PX`, the finest first.
+    """The detail of images in frequency bands: one band for each of `BAND_PX`, the finest first.
 
-    The squares grow with the magnification. Otherwise, the finest band of a magnified view would add specks, where
+    A band is the difference between two local means, or between the image and its finest local mean. The
+    means are over larger squares in magnified views. Otherwise, the finest band would add specks where
     neighbouring pixels were sampled in different cameras.
 
     Args:
@@ -116,7 +120,7 @@ def detail_bands(
         weight: weight of each pixel in the means, above 0.
         pixels: row and column of each pixel.
         shape: height and width of the images.
-        magnification: of the images, relative to the source cameras (`SourceCameras.magnification`).
+        magnification: that of the images, relative to the source cameras (`SourceCameras.magnification`).
     """
     count = colours.shape[1]
     weighted = (weight[:, None, None] * colours).flatten(1)
@@ -124,15 +128,15 @@ def detail_bands(
     finer = colours
     bands = []
     for side in band_sides_px(magnification):
-        sums = _box_means_at(image, side, pixels)
-        mean = (sums[:, :-1] / sums[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
-        bands.append(finer - mean)
-        finer = mean
+        means = _box_means_at(image, side, pixels)
+        weighted_mean = (means[:, :-1] / means[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
+        bands.append(finer - weighted_mean)
+        finer = weighted_mean
     return torch.stack(bands, 1)
 
 
 def band_sides_px(magnification: float | Float[Tensor, ""]) -> tuple[int | Int[Tensor, ""], ...]:
-    """`BAND_PX` in a magnified view, rounded down to odd numbers of pixels."""
+    """`BAND_PX` times the magnification of a view, rounded down to odd numbers of pixels."""
     if isinstance(magnification, Tensor):
         factors = magnification.clamp(1.0, MAX_MAGNIFICATION)
         return tuple(2 * ((factors * side - 1) / 2).long() + 1 for side in BAND_PX)
@@ -146,10 +150,10 @@ def _box_means_at(
     """Means over squares around pixels of an image, which is 0 beyond its border."""
     rows, columns = pixels.unbind(1)
     if isinstance(side, Tensor):
-        # An exported model's kernels have constant sizes, so boxes of any side are summed
+        # Pooling in an exported model needs a side that is known in advance; summed-area tables do not
         corners = torch.stack([-(side // 2), side // 2 + 1])
         sums = BoxSums.of(image[None]).boxes(rows[:, None, None] + corners, columns[:, None, None] + corners)
-        return (sums[:, 0, 0, 0] / side.double() ** 2).float()
+        return (sums.flatten(1) / side.double() ** 2).float()
     if image.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_exporting():
         import cv2
 
@@ -179,7 +183,7 @@ def crop_to(
 ) -> Float[Tensor, "channel height width"]:
     """The first rows and columns of an image.
 
-    While `torch.export` traces, indices are gathered instead: a slice would fix whether anything is cut off.
+    While `torch.export` traces, rows and columns are gathered: a slice would fix whether anything is cut off.
     """
     if torch.compiler.is_exporting():
         rows, columns = (torch.arange(length, device=image.device) for length in shape)
@@ -215,7 +219,7 @@ class UNet(nn.Module):
         self, image: Float[Tensor, "1 channel height width"]
     ) -> Float[Tensor, "1 feature height width"]:
         """Features of the same resolution."""
-        return self._scales(F.relu(self.enter(image.contiguous(memory_format=torch.channels_last))))
+        return self._run_scales(F.relu(self.enter(image.contiguous(memory_format=torch.channels_last))))
 
     def forward_points(
         self,
@@ -223,19 +227,26 @@ class UNet(nn.Module):
         at: Int[Tensor, "point 2"],
         image: Float[Tensor, "1 other_channel height width"],
     ) -> Float[Tensor, "1 feature height width"]:
-        """`forward` of `image` after some first channels, which are `values` at the points and 0 elsewhere.
+        """The same as `forward` for an image whose first channels are 0 except at some points.
 
-        The first layer has a kernel of one pixel, so it runs on the first channels at the points only.
+        The first layer has a kernel of one pixel, so it runs on the first channels at these points only.
+
+        Args:
+            values: the first channels at the points.
+            at: row and column of each point.
+            image: the other channels.
         """
         weight = self.enter.weight
         first_channels = values.shape[1]
         channels_last = image.contiguous(memory_format=torch.channels_last)
         x = F.conv2d(channels_last, weight[:, first_channels:], self.enter.bias)
         at_points = F.linear(values, weight[:, :first_channels, 0, 0]).to(x.dtype)
-        return self._scales(F.relu(x + scatter_to_image(at_points, at, image.shape[2:])))
+        return self._run_scales(F.relu(x + scatter_to_image(at_points, at, image.shape[2:])))
 
-    def _scales(self, x: Float[Tensor, "1 feature height width"]) -> Float[Tensor, "1 feature height width"]:
-        """All but the first layer."""
+    def _run_scales(
+        self, x: Float[Tensor, "1 feature height width"]
+    ) -> Float[Tensor, "1 feature height width"]:
+        """The output of all layers after the first, for its output `x`."""
         scales = [F.relu(x + self.first(x))]
         for layer in self.down:
             stop_if_cancelled()
@@ -257,20 +268,20 @@ def run_tiled(
 ) -> Float[Tensor, "pixel output"]:
     """The output of layers at some pixels of an image, from the tiles around these pixels only.
 
-    The image has `shape`. Its first channels are `cells`, at half its resolution, upsampled
-    bilinearly; the others are `values` at the pixels, else zeros. The layers are convolutions of
-    odd kernels that keep the size, and layers that act on single pixels.
+    The image has `shape`. Its first channels are `cells`, which have half its resolution and are
+    upsampled bilinearly. Its other channels are `values` at the pixels, and zeros elsewhere. The layers
+    are convolutions that keep the size, with kernels of odd sides, and layers that act on single pixels.
     """
     # The tiles that contain a pixel
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
-    across = -(-shape[1] // TILE_PX)
-    tile_of_pixel = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
-    tiles, own = tile_of_pixel.unique(return_inverse=True)
-    tile_rows = tiles // across
-    tile_columns = tiles % across
+    tiles_per_row = -(-shape[1] // TILE_PX)
+    tile_number = pixels[:, 0] // TILE_PX * tiles_per_row + pixels[:, 1] // TILE_PX
+    tiles, tile_of_pixel = tile_number.unique(return_inverse=True)
+    tile_rows = tiles // tiles_per_row
+    tile_columns = tiles % tiles_per_row
     at_border = _reaches_border(tile_rows, tile_columns, halo, shape)
 
-    # The indices of values and of cells in each tile
+    # The indices of values and of cells in each tile and its halo: a window
     value_windows = _value_windows(pixels, shape, halo)
     cell_windows = _cell_windows(cells, halo)
     padded_values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
@@ -288,7 +299,7 @@ def run_tiled(
         inside = _inside(rows, columns, halo, shape).to(x) if at_border else None
         outputs.append(_run_unpadded(layers, x, inside))
         first += size
-    return torch.cat(outputs)[own, :, pixels[:, 0] % TILE_PX, pixels[:, 1] % TILE_PX]
+    return torch.cat(outputs)[tile_of_pixel, :, pixels[:, 0] % TILE_PX, pixels[:, 1] % TILE_PX]
 
 
 def _cell_halo(halo: int) -> int:
@@ -299,49 +310,48 @@ def _cell_halo(halo: int) -> int:
 def _value_windows(
     pixels: Pixels, shape: torch.Size, halo: int
 ) -> Int[Tensor, "tile_row tile_column height width"]:
-    """The index in `pixels` of each pixel of each tile with its halo; -1 where there is none."""
-    index = F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1)
+    """The pixels of each tile's window, as indices in `pixels`; -1 for a pixel that is not in `pixels`."""
+    index = F.pad(index_image(pixels, shape)[None], _window_padding(shape, halo, TILE_PX), value=-1)
     return _windows(index, halo, TILE_PX)[0]
 
 
 def _cell_windows(
     cells: Float[Tensor, "1 feature rows columns"], halo: int
 ) -> Int[Tensor, "tile_row tile_column height width"]:
-    """The index of each cell of each tile with its halo; beyond the border, that of the nearest cell."""
+    """The cells of each tile's window, as indices in `cells`; beyond the border, that of the nearest cell."""
     grid = cells.shape[2:]
     index = torch.arange(grid.numel(), device=cells.device).view(1, 1, *grid).double()
-    frame = _frame(grid, _cell_halo(halo), TILE_PX // CELL_PX)
-    padded = F.pad(index, frame, mode="replicate").long()
+    padding = _window_padding(grid, _cell_halo(halo), TILE_PX // CELL_PX)
+    padded = F.pad(index, padding, mode="replicate").long()
     return _windows(padded[0], _cell_halo(halo), TILE_PX // CELL_PX)[0]
 
 
 def _upsample_windows(
     coarse: Float[Tensor, "tile rows columns feature"], halo: int
 ) -> Float[Tensor, "tile height width feature"]:
-    """Windows of cells at full resolution, cut to the halo of the pixels."""
+    """Windows of cells, upsampled to pixels; what lies beyond a halo of `halo` pixels is cut off."""
     # Interpolation is faster with channels last in memory
-    fine = F.interpolate(
-        coarse.movedim(3, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False
-    ).movedim(1, 3)
+    channels_first = coarse.movedim(3, 1)
+    fine = F.interpolate(channels_first, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
     cut = CELL_PX * _cell_halo(halo) - halo
-    return fine[:, cut:-cut, cut:-cut]
+    return fine.movedim(1, 3)[:, cut:-cut, cut:-cut]
 
 
-def _frame(shape: Sequence[int], halo: int, tile: int) -> tuple[int, int, int, int]:
-    """Padding of an image by a halo, and to whole tiles."""
-    below, right = (halo + -length % tile for length in shape)
-    return halo, right, halo, below
+def _window_padding(shape: Sequence[int], halo: int, tile: int) -> tuple[int, int, int, int]:
+    """Padding of an image to whole tiles with a halo around them: left, right, top, bottom."""
+    bottom, right = (halo + (-length) % tile for length in shape)
+    return halo, right, halo, bottom
 
 
 def _windows(image: Shaped[Tensor, "channel height width"], halo: int, tile: int) -> Tensor:
-    """The windows of all tiles with their halos, [channel, tile row, tile column, height, width]."""
+    """The windows of all tiles of a padded image, [channel, tile row, tile column, height, width]."""
     return image.unfold(1, tile + 2 * halo, tile).unfold(2, tile + 2 * halo, tile)
 
 
 def _reaches_border(
     tile_rows: Int[Tensor, "tile"], tile_columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
 ) -> bool:
-    """Whether any tile with its halo reaches beyond the image."""
+    """Whether the window of any of these tiles reaches beyond the image."""
     beyond = False
     for tile, length in ((tile_rows, shape[0]), (tile_columns, shape[1])):
         first = tile * TILE_PX
@@ -352,7 +362,7 @@ def _reaches_border(
 def _inside(
     tile_rows: Int[Tensor, "tile"], tile_columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
 ) -> Float[Tensor, "tile 1 height width"]:
-    """1 where a tile with its halo is in the image; beyond it, layers must get zeros."""
+    """1 for pixels of the tiles' windows that are in the image, 0 for those beyond its border."""
     reach = torch.arange(-halo, TILE_PX + halo, device=tile_rows.device)
     row = tile_rows[:, None] * TILE_PX + reach
     column = tile_columns[:, None] * TILE_PX + reach
@@ -362,7 +372,10 @@ def _inside(
 
 
 def _run_unpadded(layers: nn.Sequential, x: Tensor, inside: Tensor | None) -> Tensor:
-    """The layers without padding; pixels that are not `inside` the image are 0 before each convolution."""
+    """The output of the layers without padding.
+
+    Pixels that are not `inside` the image are 0 before each convolution, as padding would make them.
+    """
     x = x if inside is None else x * inside
     for layer in layers:
         if not isinstance(layer, nn.Conv2d):

@@ -7,9 +7,10 @@ the proxy (the surface of the visual hull). The source cameras that see a ray be
 and aggregated. A U-Net over the view turns the samples into a distribution over depths, as networks
 on cost volumes do (MVSNet, ENeRF).
 
-At full resolution, the cameras are sampled again at the depth found, and blended. Blending softens
-the image, so detail is added in two frequency bands. It is taken from the blended colours, from one
-camera and from the rendered view, with learned gains for every pixel.
+At full resolution, the cameras are sampled again at the depth found, and their colours are blended.
+Blending softens the image, so detail is added in two frequency bands: the detail of the blended
+colours, of the most trusted camera and of the rendered view, each times a gain that the network
+predicts for every pixel.
 """
 
 from dataclasses import replace
@@ -64,14 +65,16 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
-"""A ray's cameras are chosen by what they see at these z-depths behind the proxy, in subject sizes."""
+"""The cameras of a ray are chosen by how well they see it at these z-depths behind the proxy, in subject
+sizes (`SceneScale.size_m`)."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
-"""A cell of the U-Net has the channels of `ViewImage`, its relative depth, and whether it has a depth."""
+"""The U-Net gets this many channels of a cell, apart from its ray samples: those of `ViewImage`, the depth
+of the proxy relative to the subject's median depth, and whether the proxy covers the cell."""
 NUM_CANDIDATES = 4
 """A pixel blends this many colours: those in `CandidateColours`."""
 NUM_GAINS = 3 * len(BAND_PX)
 """A pixel's detail is multiplied by this many gains: three per band, for the blended colours, the
-most trusted camera and the guess."""
+most trusted camera and the rendered view."""
 INITIAL_GAIN = 0.3
 """The blended colours have this gain in the finest band before training; all other gains are 0."""
 PIXEL_CHANNELS = 27
@@ -88,10 +91,10 @@ MARGIN_PX = 16
 
 
 class ViewImage(NamedTuple):
-    """What the network gets of the rendered view itself."""
+    """The rendered view, as an input of the network."""
 
-    guess: Image
-    """RGB on black, with holes filled by the coarse guess."""
+    filled: Image
+    """RGB on black, with holes filled by `ViewSynthNet.fill_holes`."""
     mask: Float[Tensor, "height width"]
     """M: 1 where the proxy covers the pixel."""
     coloured: Float[Tensor, "height width"]
@@ -102,15 +105,15 @@ class ViewImage(NamedTuple):
     """1 where the pixel is to be predicted."""
 
     @classmethod
-    def of(cls, view: IncompleteView, guess: Image, predicted: Mask) -> "ViewImage":
-        """The inputs from a view whose holes are filled in `guess`."""
+    def of(cls, view: IncompleteView, filled: Image, predicted: Mask) -> "ViewImage":
+        """The channels of a rendered view, given its image with filled holes and its pixels to predict."""
         coloured = view.weights.sum(0) > 0
-        return cls(guess, view.mask, coloured.float(), view.weights.amax(0), predicted.float())
+        return cls(filled, view.mask, coloured.float(), view.weights.amax(0), predicted.float())
 
     def stacked(self) -> Float[Tensor, "7 height width"]:
         """All channels in one image."""
         planes = [self.mask, self.coloured, self.largest_weight, self.predicted]
-        return torch.cat([self.guess, torch.stack(planes)])
+        return torch.cat([self.filled, torch.stack(planes)])
 
 
 class CandidateColours(NamedTuple):
@@ -122,18 +125,27 @@ class CandidateColours(NamedTuple):
     """The colour of the most trusted camera."""
     soft: Float[Tensor, "pixel 3"]
     """The mean over all depth hypotheses, interpolated between cells."""
-    guess: Float[Tensor, "pixel 3"]
-    """The rendered view, or the coarse guess in holes."""
-    soft_mask: Float[Tensor, "pixel 1"]
-    """The mean mask, interpolated as `soft` is; an input of the last convolutions."""
+    rendered: Float[Tensor, "pixel 3"]
+    """The rendered view, with holes filled by `ViewSynthNet.fill_holes`."""
 
     def stacked(self) -> Float[Tensor, "pixel 4 3"]:
-        """The colours, in the order of their scores."""
-        return torch.stack([self.trusted, self.single, self.soft, self.guess], 1)
+        """All colours in one tensor. The network scores them in this order."""
+        return torch.stack([self.trusted, self.single, self.soft, self.rendered], 1)
+
+
+class HypothesisMeans(NamedTuple):
+    """The means over the depth hypotheses of each pixel's ray, interpolated between cells."""
+
+    colour: Float[Tensor, "pixel 3"]
+    """RGB in [0, 1], not multiplied by alpha."""
+    mask: Float[Tensor, "pixel 1"]
 
 
 class ViewSynthNet(Network):
-    """Predicts colour, alpha, confidence and depth of pixels on the proxy and the rim around it."""
+    """Predicts colour, alpha, confidence and depth of pixels on the proxy and its rim.
+
+    The rim is a band of few pixels around the proxy that the subject may also cover (`geometry.rim`).
+    """
 
     config: ViewsConfig  # pyright: ignore
     trained_in_bfloat16 = True
@@ -146,7 +158,7 @@ class ViewSynthNet(Network):
         config = config or ViewsConfig()
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
 
-        # The first guess for holes, and the predictor of errors
+        # The coarse fill of holes, and the predictor of errors
         self.coarse = None
         if config.coarse_fill == "rays":
             self.coarse = RayFill(RaysConfig(num_views=config.num_views)).requires_grad_(False)
@@ -164,14 +176,13 @@ class ViewSynthNet(Network):
         fine = config.fine_features
         last = nn.Conv2d(fine, sum(OUTPUT_CHANNELS), 3, padding=1)
 
-        # All gains of detail begin at 0, except that of the blended colours in the finest band
-        all_gains = slice(-NUM_GAINS, None)
-        finest_blended = -NUM_GAINS
+        # All gains of detail begin at 0, except the first: that of the blended colours in the finest band
         with torch.no_grad():
             assert last.bias is not None
-            last.weight[all_gains] = 0
-            last.bias[all_gains] = 0
-            last.bias[finest_blended] = INITIAL_GAIN
+            gain_biases = last.bias[-NUM_GAINS:]
+            gain_biases[:] = 0
+            gain_biases[0] = INITIAL_GAIN
+            last.weight[-NUM_GAINS:] = 0
         self.blending = nn.Sequential(
             nn.Conv2d(inputs, fine, 3, padding=1),
             nn.ReLU(),
@@ -186,7 +197,7 @@ class ViewSynthNet(Network):
         sources: SourceCameras,
         scale: SceneScale | None = None,
         where: Mask | None = None,
-        guess: Image | None = None,
+        filled: Image | None = None,
         allow_large_cells: bool = False,
     ) -> ViewPrediction:
         """Predicts pixels of a view. `where` selects them; the view's error mask E is ignored.
@@ -196,18 +207,18 @@ class ViewSynthNet(Network):
             sources: the cameras to sample.
             scale: the scale of the whole view, if `view` is a crop.
             where: pixels outside this mask are not predicted; None predicts the whole proxy and its rim.
-            guess: the `coarse_guess` of the whole view, cropped as `view` is; computed if None.
-            allow_large_cells: whether the cells of a magnified view are larger (`LARGE_CELLS_FROM`).
-                Those of training and of exported models are not.
+            filled: the result of `fill_holes` for the whole view, cropped as `view` is; computed if None.
+            allow_large_cells: whether a magnified view gets larger cells (`LARGE_CELLS_FROM`).
+                Training and exported models do not use them.
         """
-        if guess is None:
-            guess = self.coarse_guess(view, sources)
+        if filled is None:
+            filled = self.fill_holes(view, sources)
         if scale is None:
             scale = SceneScale.of(view)
         view = replace(view, depth=rim_depth(view.depth))
         on_proxy = view.depth > 0
         predicted = on_proxy if where is None else where & on_proxy
-        image = ViewImage.of(view, guess, predicted)
+        image = ViewImage.of(view, filled, predicted)
         if allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM:
             half_view, half_predicted, half_image = halve(view, predicted, image)
             distribution = self._depth_distribution(half_view, sources, scale, half_predicted, half_image)
@@ -217,14 +228,14 @@ class ViewSynthNet(Network):
         return self._blend(view, sources, scale, torch.nonzero(predicted), image, distribution)
 
     @torch.no_grad()
-    def coarse_guess(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
-        """The whole view with its holes filled by the coarse fill; `quick` fills them from their surroundings only."""
+    def fill_holes(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
+        """The image of the whole view, with holes filled coarsely; `quick` fills them from their surroundings only."""
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
         return self.coarse(replace(view, error=view.holes.to(view.error)), sources).float()
 
     def source_names(self, view: IncompleteView) -> tuple[str, ...]:
-        """Names of the cameras that rays are sampled in, the closest first."""
+        """Names of the source cameras that are sampled for a view, the closest first."""
         return view.closest_views(self.config.num_views)
 
     @torch.no_grad()
@@ -241,17 +252,16 @@ class ViewSynthNet(Network):
     @torch.no_grad()
     @one_thread()
     def predict_depth(self, view: IncompleteView, context: ContextProvider) -> DepthMap | None:
-        """The depth of the subject on the proxy and its rim, by the first half of the network: no colour is blended."""
+        """The depth of the subject on the proxy and its rim. Only the first half of the network runs: no blending."""
         sources = SourceCameras.closest_to(view, context, self.config.num_views)
         if sources is None:
             return None
-        guess = self.coarse_guess(view, sources, quick=True)
+        filled = self.fill_holes(view, sources, quick=True)
         scale = SceneScale.of(view)
         view = replace(view, depth=rim_depth(view.depth))
         predicted = view.depth > 0
-        distribution = self._depth_distribution(
-            view, sources, scale, predicted, ViewImage.of(view, guess, predicted)
-        )
+        image = ViewImage.of(view, filled, predicted)
+        distribution = self._depth_distribution(view, sources, scale, predicted, image)
         pixels = torch.nonzero(predicted)
         surface = surface_points(view.depth, scale, pixels, distribution)
         found = torch.stack([surface.depth, surface.probability], 1)
@@ -259,7 +269,7 @@ class ViewSynthNet(Network):
         return DepthMap(depth, confidence)
 
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
-        """Computes the image pyramids of these cameras."""
+        """Computes the image pyramids of these cameras, which `context` keeps for later views."""
         SourceCameras.of(views, None, context)
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
@@ -275,15 +285,16 @@ class ViewSynthNet(Network):
 
         Pixels that `view.fade` marks as background are not predicted but attenuated. With a
         `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their
-        surroundings. Predictions are steadied by the viewer's last view, which is `state`.
+        surroundings. Small changes from the viewer's last view, which is `state`, are partly undone
+        to reduce flicker (`steadying`).
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
-        fades = torch.zeros_like(where) if view.fade is None else view.fade > 0
+        faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
         # At the lowest quality, holes are filled without the cameras
-        if fraction == 0 and bool((where | fades).any()):
-            return fallback_view(view, fades, self.coarse_guess(view, None, quick=True)), state
+        if fraction == 0 and bool((where | faded).any()):
+            return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
         # Without a pixel to predict, or without a camera, the view is only attenuated
         sources = None
@@ -292,14 +303,14 @@ class ViewSynthNet(Network):
         if sources is None and view.fade is None:
             return CompletedView(view, view.rgb), state
         if sources is None:
-            return fallback_view(view, fades), state
+            return fallback_view(view, faded), state
 
-        # Otherwise, the subject or a part of it is predicted
+        # Otherwise, the whole subject is predicted, or a fraction of it at reduced quality
         reduced_quality = fraction is not None
-        guess = self.coarse_guess(view, sources, quick=reduced_quality)
-        ray_fill = None if self.coarse is None or reduced_quality else guess
-        prediction = self(view, sources, where=where, guess=guess, allow_large_cells=True)
-        completed = prediction.composite_into(view, where, fades, ray_fill)
+        filled = self.fill_holes(view, sources, quick=reduced_quality)
+        uses_ray_fill = self.coarse is not None and not reduced_quality
+        prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
+        completed = prediction.composite_into(view, where, faded, filled if uses_ray_fill else None)
         completed, last = steady(completed, where, state)
         return opaque_in_mask(completed), last
 
@@ -311,21 +322,21 @@ class ViewSynthNet(Network):
         predicted: Mask,
         image: ViewImage,
     ) -> DepthDistribution:
-        """Samples the cameras on the rays of all cells, and judges the samples by a U-Net over the view."""
+        """Samples the cameras on the rays of all cells, and scores the samples by a U-Net over the view."""
         # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
-        predicted_depth = nearest_depth(view.depth * predicted)
-        cells = torch.nonzero(predicted_depth > 0)
+        proxy_depth = nearest_depth(view.depth * predicted)
+        cells = torch.nonzero(proxy_depth > 0)
         rows, columns = cells.unbind(1)
-        proxy_z = predicted_depth[rows, columns][:, None]
+        proxy_z = proxy_depth[rows, columns][:, None]
         uv_px = CELL_PX * (cells.flip(1).double() + 0.5)
         choosing_z = proxy_z + scale.size_m * proxy_z.new_tensor(CHOOSING_OFFSETS)
         cameras = choose_cameras(Rays(view, scale, uv_px, choosing_z), sources, RAY_VIEWS)
         rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * proxy_z.new_tensor(OFFSETS), cameras)
 
-        # Further inputs of the U-Net, in all cells: the rendered view, and the depth of the proxy
-        proxy_depth = nearest_depth(view.depth)
-        on_proxy = proxy_depth > 0
-        relative = torch.where(on_proxy, ((proxy_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        # Further inputs of the U-Net, in all cells: the rendered view, and the depth of the whole proxy
+        whole_depth = nearest_depth(view.depth)
+        on_proxy = whole_depth > 0
+        relative = torch.where(on_proxy, ((whole_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
         cell_channels = torch.cat([means, relative[None], on_proxy[None].to(means)])
 
@@ -339,8 +350,8 @@ class ViewSynthNet(Network):
                     inputs, cells, concatenate_channels(cell_channels.to(inputs))
                 )
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
-        cell_index = index_image(cells, predicted_depth.shape)
-        return DepthDistribution(cells, cell_index, predicted_depth, logits, samples, cameras, features)
+        cell_index = index_image(cells, proxy_depth.shape)
+        return DepthDistribution(cells, cell_index, proxy_depth, logits, samples, cameras, features)
 
     def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
         """The aggregated samples of the rays of cells, computed in chunks."""
@@ -349,7 +360,7 @@ class ViewSynthNet(Network):
             stop_if_cancelled()
             samples = sample_rays(chunk, sources, step_px=float(CELL_PX))
             parts.append(self.sample_aggregator(samples))
-        return AggregatedSamples(*map(torch.cat, zip(*parts, strict=True)))
+        return AggregatedSamples.cat(parts)
 
     def _blend(
         self,
@@ -361,34 +372,34 @@ class ViewSynthNet(Network):
         distribution: DepthDistribution,
     ) -> ViewPrediction:
         """Samples the cameras on the surface that each pixel shows, and blends them."""
-        # Sample the cameras at the depth found: each pixel's ray has one sample, with index 0
+        # Sample the cameras at the depth found: each pixel's ray has one sample, which is [:, 0] below
         stop_if_cancelled()
         surface = surface_points(view.depth, scale, pixels, distribution)
-        cameras = None if distribution.cameras is None else distribution.cameras[surface.cell]
-        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, surface.depth.detach()[:, None], cameras)
+        rays = surface_rays(view, scale, pixels, surface, distribution)
         samples = sample_rays(rays, sources, step_px=1.0, cubic=True)
 
         # Weigh the cameras
         stop_if_cancelled()
         aggregated = self._aggregate_pixels(samples, surface, distribution)
-        mask = aggregated.mask[:, 0]
+        mask = aggregated.mask[:, 0].squeeze(1)
 
-        # Score the candidate colours and the gains of detail by the last convolutions
-        colours = candidate_colours(samples.features[:, 0], aggregated, image, pixels, distribution)
+        # The last convolutions score the candidate colours, and predict alpha, confidence and gains
+        means = hypothesis_means(distribution, pixels)
+        colours = candidate_colours(samples.features[:, 0], aggregated, means, image, pixels)
         statistics = RayStatistics.unstack(samples.statistics[:, 0])
-        inputs = pixel_inputs(colours, mask, statistics, surface, image, pixels)
+        inputs = pixel_inputs(colours, mask, means.mask, statistics, surface, image, pixels)
         inputs = torch.cat([inputs, aggregated.features[:, 0]], 1)
         out = self._blending_layers(inputs, pixels, view.mask.shape, features_at_cells(distribution, view))
         scores, alpha_logit, confidence_logit, gains = out.split(OUTPUT_CHANNELS, 1)
 
         # Blend the colours, then add detail
         blended = (scores.softmax(1)[..., None] * colours.stacked()).sum(1)
-        detailed = torch.stack([blended, colours.single, colours.guess], 1)
+        detailed = torch.stack([blended, colours.single, colours.rendered], 1)
         magnification = sources.magnification(view.camera, scale)
-        detail = amplify_detail(detailed, mask[:, 0], gains, pixels, view.mask.shape, magnification)
+        detail = amplify_detail(detailed, mask, gains, pixels, view.mask.shape, magnification)
 
         # Composite on black
-        alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask[:, 0] - 0.5)).sigmoid()
+        alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask - 0.5)).sigmoid()
         rgb = alpha[:, None] * (blended + detail).clamp(0, 1)
         return ViewPrediction(
             pixels,
@@ -429,21 +440,37 @@ class ViewSynthNet(Network):
 def halve(
     view: IncompleteView, predicted: Mask, image: ViewImage
 ) -> tuple[IncompleteView, Bool[Tensor, "rows columns"], ViewImage]:
-    """A view at half its resolution, with its pixels to predict and its inputs: its cells are twice as large."""
+    """The view at half its resolution, its pixels to predict, and its `ViewImage`.
+
+    A cell of it covers 4 x 4 pixels of the whole resolution.
+    """
     half_predicted = nearest_depth(view.depth * predicted) > 0
-    guess = downsample2x(replace(view, rgb=image.guess)).rgb
+    filled = downsample2x(replace(view, rgb=image.filled)).rgb
     half_view = downsample2x(view)
-    return half_view, half_predicted, ViewImage.of(half_view, guess, half_predicted)
+    return half_view, half_predicted, ViewImage.of(half_view, filled, half_predicted)
+
+
+def surface_rays(
+    view: IncompleteView,
+    scale: SceneScale,
+    pixels: Pixels,
+    surface: SurfacePoints,
+    distribution: DepthDistribution,
+) -> Rays:
+    """The rays of some pixels, each with one sample on the surface and the cameras of the pixel's cell."""
+    cameras = None if distribution.cameras is None else distribution.cameras[surface.cell]
+    uv_px = pixels.flip(1).double() + 0.5
+    return Rays(view, scale, uv_px, surface.depth.detach()[:, None], cameras)
 
 
 def features_at_cells(
     distribution: DepthDistribution, view: IncompleteView
 ) -> Float[Tensor, "1 feature rows columns"]:
-    """The U-Net's features in a view's cells of `CELL_PX`, between larger cells bilinearly."""
-    larger = distribution.cell_px // CELL_PX
-    if larger == 1:
+    """The U-Net's features in cells of `CELL_PX`; those of larger cells are interpolated bilinearly."""
+    factor = distribution.cell_px // CELL_PX
+    if factor == 1:
         return distribution.features
-    fine = F.interpolate(distribution.features, scale_factor=larger, mode="bilinear", align_corners=False)
+    fine = F.interpolate(distribution.features, scale_factor=factor, mode="bilinear", align_corners=False)
     rows, columns = (-(-length // CELL_PX) for length in view.mask.shape)
     return fine[:, :, :rows, :columns]
 
@@ -456,9 +483,17 @@ def amplify_detail(
     shape: torch.Size,
     magnification: float | Float[Tensor, ""],
 ) -> Float[Tensor, "pixel 3"]:
-    """The detail of these images: their bands times the gains, summed over bands and images.
+    """The detail to add to some pixels: bands of several images, multiplied by gains and summed.
 
     Detail is the difference from a local mean, in which pixels are weighted by `mask`.
+
+    Args:
+        colours: the colour of each pixel in each image.
+        mask: the cameras' mean mask at each pixel.
+        gains: the gain of each band of each image, bands first, as `NUM_GAINS`.
+        pixels: row and column of each pixel.
+        shape: height and width of the images.
+        magnification: that of the images (`SourceCameras.magnification`).
     """
     bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)
     gain_of_image = gains.unflatten(1, bands.shape[1:3])[..., None]  # [pixel, band, image, 1]
@@ -468,40 +503,45 @@ def amplify_detail(
 def candidate_colours(
     features: Float[Tensor, "pixel view feature"],
     aggregated: AggregatedSamples,
+    means: HypothesisMeans,
     image: ViewImage,
     pixels: Pixels,
-    distribution: DepthDistribution,
 ) -> CandidateColours:
-    """The colours that each pixel may have.
+    """The colours that each pixel may blend.
 
     Args:
-        features: what every camera shows of each pixel's sample on the surface.
-        aggregated: these samples after aggregation over cameras.
+        features: features of each pixel's sample on the surface, in each camera.
+        aggregated: these samples after aggregation over cameras, one per pixel.
+        means: the means over the depth hypotheses of each pixel's ray.
         image: the rendered view.
         pixels: row and column of each pixel.
-        distribution: the depth hypotheses of the cells.
     """
-    # On the surface: all cameras by their trust, and the most trusted one alone
+    # The mean of the cameras, weighted by trust
     trusted = unpremultiply(aggregated.colour[:, 0], aggregated.mask[:, 0])
+
+    # The most trusted camera alone
     best = aggregated.trust[:, 0].argmax(1)
     best_features = features.gather(1, best[:, None, None].expand(-1, 1, FEATURES))[:, 0]
     single = unpremultiply(best_features[:, COLOUR], best_features[:, MASK])
 
-    # On the whole ray: the mean over depth hypotheses
-    probability = distribution.logits.softmax(1)[..., None]
-    mean_colour = (probability * distribution.samples.colour).sum(1)
-    mean_mask = (probability * distribution.samples.mask).sum(1)
-    means = distribution.interpolate(torch.cat([mean_colour, mean_mask], 1), pixels)
-    soft_colour, soft_mask = means.split((3, 1), 1)
-    soft = unpremultiply(soft_colour, soft_mask)
-
     rows, columns = pixels.unbind(1)
-    return CandidateColours(trusted, single, soft, image.guess[:, rows, columns].T, soft_mask)
+    return CandidateColours(trusted, single, means.colour, image.filled[:, rows, columns].T)
+
+
+def hypothesis_means(distribution: DepthDistribution, pixels: Pixels) -> HypothesisMeans:
+    """The means over the depth hypotheses of the rays of pixels (row, column)."""
+    probability = distribution.logits.softmax(1)[..., None]
+    cell_colour = (probability * distribution.samples.colour).sum(1)
+    cell_mask = (probability * distribution.samples.mask).sum(1)
+    means = distribution.interpolate(torch.cat([cell_colour, cell_mask], 1), pixels)
+    colour, mask = means.split((3, 1), 1)
+    return HypothesisMeans(unpremultiply(colour, mask), mask)
 
 
 def pixel_inputs(
     colours: CandidateColours,
-    mask: Float[Tensor, "pixel 1"],
+    mask: Float[Tensor, "pixel"],
+    soft_mask: Float[Tensor, "pixel 1"],
     statistics: RayStatistics,
     surface: SurfacePoints,
     image: ViewImage,
@@ -509,18 +549,26 @@ def pixel_inputs(
 ) -> Float[Tensor, "pixel 27"]:
     """Colours, masks and statistics of each pixel: inputs of the last convolutions.
 
-    Their order is that of the shipped weights. `mask` is the cameras' mean mask on the surface, and
-    `statistics` are those of the sample there.
+    Trained weights depend on the order of these channels.
+
+    Args:
+        colours: the candidate colours.
+        mask: the cameras' mean mask on the surface.
+        soft_mask: the mean mask over the depth hypotheses.
+        statistics: those of the sample on the surface.
+        surface: the points that the pixels show.
+        image: the rendered view.
+        pixels: row and column of each pixel.
     """
     rows, columns = pixels.unbind(1)
     inputs = [
         colours.trusted,
         colours.single,
         colours.soft,
-        colours.guess,
-        colours.trusted - colours.guess,
-        mask,
-        colours.soft_mask,
+        colours.rendered,
+        colours.trusted - colours.rendered,
+        mask[:, None],
+        soft_mask,
         image.coloured[rows, columns][:, None],
         image.largest_weight[rows, columns][:, None],
         statistics.colour_variance.mean(1, keepdim=True),

@@ -27,12 +27,12 @@ RAY_FILL_SHARE = 0.7
 few holes in training."""
 SAME_SURFACE = 0.03
 """A pixel shows the surface of its cell if their depths on the proxy differ by less than this, in
-subject sizes."""
+subject sizes (`SceneScale.size_m`)."""
 
 
 @dataclass(frozen=True)
 class IslandRule:
-    """Which islands around the subject are remains of a hull artefact, most of which the model made transparent."""
+    """Which islands around the subject are removed: remains of hull artefacts that the model left visible."""
 
     visible: float = 1 / 16
     """A pixel belongs to an island if its alpha or its colour is above this."""
@@ -45,13 +45,13 @@ class IslandRule:
 
 
 class DepthDistribution(NamedTuple):
-    """The depth hypotheses of the cells of a view, judged by their samples and their neighbours."""
+    """The depth hypotheses of the cells of a view, with scores from their samples and their neighbourhood."""
 
     cells: Int[Tensor, "cell 2"]
-    """Row and column."""
+    """Row and column of each cell."""
     cell_index: Int[Tensor, "rows columns"]
     """Index of the cell at each row and column; -1 where there is none."""
-    depth: Float[Tensor, "rows columns"]
+    proxy_depth: Float[Tensor, "rows columns"]
     """The proxy's nearest z-depth in each cell, metres; 0 where there is no cell."""
     logits: Float[Tensor, "cell sample"]
     """Logits of the surface being at each depth hypothesis."""
@@ -67,20 +67,26 @@ class DepthDistribution(NamedTuple):
         self, values: Float[Tensor, "cell channel"], pixels: Pixels
     ) -> Float[Tensor, "pixel channel"]:
         """The cells' values at pixels (row, column), interpolated bilinearly between existing cells."""
-        weighted = F.pad(values, (0, 1), value=1.0)
+        weighted = F.pad(values, (0, 1), value=1.0)  # the last channel sums the weights of existing cells
         padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
 
-        # Shares of a pixel's own cell, and of the cell that is next to the pixel's centre
+        # In each direction, a pixel lies between the centre of its own cell and that of a neighbour
         own = pixels // self.cell_px
         from_center = (pixels % self.cell_px + 0.5) / self.cell_px - 0.5
         last = torch.tensor(self.cell_index.shape, device=own.device) - 1
-        other = torch.minimum((own + from_center.sign().long()).clamp(min=0), last)
-        share = from_center.abs().to(padded)
-        parts = []
-        for row_share, rows in ((1 - share[:, :1], own), (share[:, :1], other)):
-            for column_share, columns in ((1 - share[:, 1:], own), (share[:, 1:], other)):
-                index = self.cell_index[rows[:, 0], columns[:, 1]]
-                parts.append(row_share * column_share * padded[index])
+        neighbour = torch.minimum((own + from_center.sign().long()).clamp(min=0), last)
+        own_row, own_column = own.unbind(1)
+        next_row, next_column = neighbour.unbind(1)
+        row_weight, column_weight = from_center.abs().to(padded).unbind(1)
+
+        # The weighted sum of the four cells around the pixel
+        corners = (
+            (own_row, own_column, (1 - row_weight) * (1 - column_weight)),
+            (own_row, next_column, (1 - row_weight) * column_weight),
+            (next_row, own_column, row_weight * (1 - column_weight)),
+            (next_row, next_column, row_weight * column_weight),
+        )
+        parts = [weight[:, None] * padded[self.cell_index[row, column]] for row, column, weight in corners]
         total = torch.stack(parts).sum(0)
         return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
 
@@ -120,7 +126,7 @@ class ViewPrediction(NamedTuple):
         self,
         view: IncompleteView,
         predicted: Mask,
-        fades: Mask,
+        faded: Mask,
         fill: Image | None = None,
         keep_islands: bool = False,
     ) -> CompletedView:
@@ -129,7 +135,7 @@ class ViewPrediction(NamedTuple):
         Args:
             view: the rendered view.
             predicted: the pixels of this prediction.
-            fades: pixels that are partly background, which are attenuated by E.
+            faded: pixels that are partly background, which are attenuated by E.
             fill: the output of `RayFill`, to blend into holes.
             keep_islands: keep the `artefact_islands`, which are removed otherwise.
         """
@@ -152,7 +158,9 @@ class ViewPrediction(NamedTuple):
             depth = depth * keep
 
         E = view.error
-        changed = predicted | fades
+        changed = predicted | faded
+
+        # The confidence of a pixel that is not predicted is 1 on the subject and 0 elsewhere
         return CompletedView(
             view,
             rgb=blend(view.rgb, E, rgb, changed.to(E)),
@@ -167,8 +175,8 @@ def surface_points(
 ) -> SurfacePoints:
     """The points that pixels show, by the depth distribution of the cells around them.
 
-    A pixel starts from its own depth on the proxy, unless its cell has the depth of another surface
-    in front of it.
+    A pixel's point lies behind its own depth on the proxy, or behind that of its cell, if the cell
+    has the depth of another surface in front of it.
     """
     # The most probable hypothesis, and the mean offset around it
     shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
@@ -181,7 +189,7 @@ def surface_points(
     cell_row, cell_column = (pixels // distribution.cell_px).unbind(1)
     cell = distribution.cell_index[cell_row, cell_column]
     own_depth = proxy_depth[tuple(pixels.T)]
-    cell_depth = distribution.depth[tuple(distribution.cells.T)][cell]
+    cell_depth = distribution.proxy_depth[cell_row, cell_column]
     same_surface = (own_depth - cell_depth).abs() < SAME_SURFACE * scale.size_m
     depth = torch.where(same_surface, own_depth, cell_depth) + scale.size_m * offset
     return SurfacePoints(cell, best, shares.amax(1), offset, depth)
@@ -195,7 +203,7 @@ def artefact_islands(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
     rule = IslandRule()
     visible = (torch.maximum(colour, alpha) > rule.visible).cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
-    if count <= 2:
+    if count <= 2:  # the background and at most one island
         return torch.zeros_like(predicted)
     area = stats[:, cv2.CC_STAT_AREA]
     share = area / area[1:].max()

@@ -1,4 +1,4 @@
-"""Fills holes pixel by pixel from the source cameras: the model `rays`, and the first guess of the default model.
+"""Fills holes pixel by pixel from the source cameras: the model `rays`, and the coarse fill of the default model.
 
 The true surface in a hole is at the proxy or behind it, and cameras that see it agree on its
 colour. So each missing pixel becomes a convex mix of candidates: the colours that the cameras have
@@ -148,10 +148,10 @@ class RayFill(Network, Fill):
     @one_thread()
     def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Image:
         """The view's image with all of E filled; None for `sources` leaves the smooth fill."""
-        guess = fill(view.rgb, view.error > 0, view.mask > 0)
+        smooth = fill(view.rgb, view.error > 0, view.mask > 0)
         pixels = torch.nonzero((view.error > 0) & (view.depth > 0).any())
-        colours = self.mix(gather_ray_inputs(view, sources, pixels, guess))
-        return guess.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
+        colours = self.mix(gather_ray_inputs(view, sources, pixels, smooth))
+        return smooth.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 
     def fill_view(self, view: IncompleteView, context: ContextProvider) -> Image:
         """The mixed colours."""
@@ -245,11 +245,11 @@ def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pi
 
 
 def gather_ray_inputs(
-    view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, guess: Image | None = None
+    view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, smooth: Image | None = None
 ) -> RayInputs:
-    """The network's inputs for pixels (row, column) of a view; `guess` is the view with E filled smoothly, if made."""
-    if guess is None:
-        guess = fill(view.rgb, view.error > 0, view.mask > 0)
+    """The network's inputs for pixels (row, column) of a view; `smooth` is the view with E filled smoothly, if made."""
+    if smooth is None:
+        smooth = fill(view.rgb, view.error > 0, view.mask > 0)
     scale = SceneScale.of(view)
     if sources is None:
         features = view.depth.new_zeros(len(pixels), len(OFFSETS), 1, sum(CAMERA_CHANNELS))
@@ -258,12 +258,12 @@ def gather_ray_inputs(
         samples = sample_behind_proxy(view, pixels, sources, scale=scale)
         features = samples.features
         smallest = RayStatistics.unstack(samples.statistics).smallest_masks
-    image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), (RADIUS_PX,) * 4)
+    image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], smooth]), (RADIUS_PX,) * 4)
     reach = torch.arange(2 * RADIUS_PX + 1, device=image.device)
     rows = pixels[:, 0, None] + reach
     columns = pixels[:, 1, None] + reach
     window = image[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
-    return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels, scale))
+    return RayInputs(features, smallest, window, *multi_scale_context(view, smooth, pixels, scale))
 
 
 def sample_behind_proxy(
@@ -290,7 +290,7 @@ def sample_behind_proxy(
 
 
 def multi_scale_context(
-    view: IncompleteView, guess: Image, pixels: Pixels, scale: SceneScale | None = None
+    view: IncompleteView, smooth: Image, pixels: Pixels, scale: SceneScale | None = None
 ) -> tuple[Float[Tensor, "neighbourhood 12 11 11"], Int[Tensor, "pixel"]]:
     """`RayInputs.neighbourhoods` of pixels (row, column), and the index of each pixel's neighbourhood.
 
@@ -302,7 +302,7 @@ def multi_scale_context(
     if scale is None:
         scale = SceneScale.of(view)
     depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
-    sums = BoxSums.of(torch.cat([guess, view.mask[None], view.error[None], depth[None]])[None])
+    sums = BoxSums.of(torch.cat([smooth, view.mask[None], view.error[None], depth[None]])[None])
 
     # The cells that pixels are in
     subject_px = (view.mask > 0).sum().sqrt().double()

@@ -1,10 +1,10 @@
-"""Steadies films: the last view of a viewer, moved along with the subject, holds back what changes without reason.
+"""Reduces flicker: small changes from a viewer's last view, moved along with the subject, are partly undone.
 
-Every frame is predicted on its own, so that outlines, colours and small pieces flicker where cameras
-are few. Dense optical flow (DIS; Kroeger et al., ECCV 2016) aligns the last completed view with the
-new one. Their difference is split into means over small squares and the detail around these. A part
-of each is taken back where it is small: large differences are real changes, or errors of the flow.
-Detail is held to a much smaller difference, so that it stays as sharp as it was predicted.
+Every frame is predicted on its own, so outlines, colours and small pieces flicker where cameras are
+few. Dense optical flow (DIS; Kroeger et al., ECCV 2016) aligns the last completed view with the new
+one. Their difference is split into means over small squares and the detail around these. Where
+either is small, a part of it is undone; large differences are real changes, or errors of the flow.
+Detail must differ much less than means to be changed, so that it stays as sharp as it was predicted.
 """
 
 import math
@@ -23,11 +23,11 @@ from viewmend.types import CompletedView
 Channels = Float32[np.ndarray, "height width 4"]
 """RGB on black, and alpha."""
 MEAN_WEIGHT = 0.7
-"""The largest share of a difference of means that is taken back."""
+"""The largest share of a difference of means that is undone."""
 MEAN_SIMILAR = 0.2
 """The share falls to 1/e of `MEAN_WEIGHT` at this difference of means, in [0, 1]."""
 DETAIL_WEIGHT = 0.5
-"""The largest share of a difference of detail that is taken back."""
+"""The largest share of a difference of detail that is undone."""
 DETAIL_SIMILAR = 0.05
 """The share falls to 1/e of `DETAIL_WEIGHT` at this difference of detail, in [0, 1]."""
 MEAN_PX = 5
@@ -71,7 +71,7 @@ class LastView(State):
 def steady(
     completed: CompletedView, predicted: Bool[Tensor, "height width"], last: State
 ) -> tuple[CompletedView, LastView]:
-    """A view whose predicted pixels are steadied by the viewer's last view, and the viewer's next state.
+    """A view whose predicted pixels flicker less than they did, and the viewer's next state.
 
     Without a last view, or if it shows something else (`LastView.precedes`), the view is unchanged.
     """
@@ -87,7 +87,7 @@ def steady(
 
 
 def steadying_change(now: Channels, before: Channels) -> Channels:
-    """What is added to a view, given the last one in the same image coordinates."""
+    """The change of a view that reduces flicker, given the last view in the same image coordinates."""
     height, width = now.shape[:2]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = search.calc(_grey(now), _grey(before), None)  # pyright: ignore[reportCallIssue, reportArgumentType]
@@ -103,7 +103,7 @@ def steadying_change(now: Channels, before: Channels) -> Channels:
 
 
 def _part(difference: Channels, weight: float, similar: float) -> Channels:
-    """The part of a difference that is taken back: nearly `weight` of small ones, little of those above `similar`."""
+    """The part of a difference that is undone: nearly `weight` of small ones, little of those above `similar`."""
     largest = np.abs(difference).max(-1, keepdims=True)
     return weight * np.exp(-((largest / similar) ** 2)) * difference
 
