@@ -162,7 +162,10 @@ class TrainingView:
 
     @classmethod
     def of(cls, sample: Sample, net: ViewSynthNet, smooth_fill: bool = False) -> "TrainingView":
-        """The view of a sample with alpha and `ray_views`; holes are filled by `net`, or from their surroundings."""
+        """The view of a sample with alpha and `ray_views`.
+
+        Holes are filled by `net`, or from their surroundings if `smooth_fill`.
+        """
         assert sample.ray_views and sample.alpha is not None, "stored scenes have both"
         view = sample.view
         truth = sample.truth

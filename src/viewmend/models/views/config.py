@@ -70,7 +70,7 @@ class ViewsConfig(Sizes):
     error_features: Annotated[int, Meta(ge=0, le=1024)] = 0
     """Channels of the `ErrorPredictor`; 0 for a model without one."""
     coarse_fill: Literal["smooth", "rays"] = "smooth"
-    """How holes are filled before the prediction: smoothly, or by a trained `RayFill` whose weights stay fixed."""
+    """How holes are filled before the prediction: smoothly, or by a trained `RayFill` with fixed weights."""
 
 
 @dataclass(frozen=True, kw_only=True)

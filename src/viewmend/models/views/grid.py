@@ -21,15 +21,15 @@ CELL_PX = 2
 TILE_PX = 32
 """The tiles of `run_tiled` have this side, pixels, which is a multiple of `CELL_PX`."""
 TILES_AT_ONCE = (8, 4, 2, 1)
-"""The layers run on this many tiles at a time. There are few such sizes, because convolutions are compiled for each."""
+"""The layers run on one of these numbers of tiles at a time, because convolutions are compiled for each."""
 BAND_PX = (3, 7)
 """Means over squares of these sides, pixels, separate the bands of detail. The sides are those for a view
 that shows the subject as large as the source cameras do; see `band_sides_px`."""
 MAX_MAGNIFICATION = 8.0
 """The squares grow with a view's magnification up to this factor."""
 LARGE_CELLS_FROM = 3.0
-"""Views of at least this magnification have cells of twice the side. There, a normal cell is smaller than a pixel
-of the source cameras: the depths of neighbouring cells would differ by chance, which shows as specks."""
+"""Views of at least this magnification have cells of twice the side. There, a normal cell is smaller than
+a pixel of the source cameras: the depths of neighbouring cells would differ by chance, which shows as specks."""
 WIDTH_STEP = 16
 """The U-Net adds this many channels at each coarser scale."""
 MIN_COVERAGE = 1e-6
@@ -79,7 +79,7 @@ def upsample2x(
 
 
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
-    """The smallest depth of the pixels in each cell, metres; pixels of depth 0 have none. 0 if no pixel has one."""
+    """The smallest depth in each cell, metres, of the pixels that have one (above 0); 0 if no pixel has."""
     height, width = depth.shape
     far = F.pad(torch.where(depth > 0, depth, BEYOND_M), (0, width % 2, 0, height % 2), value=BEYOND_M)
     nearest = -F.max_pool2d(-far[None], CELL_PX)[0]

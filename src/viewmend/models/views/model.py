@@ -229,7 +229,7 @@ class ViewSynthNet(Network):
 
     @torch.no_grad()
     def fill_holes(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
-        """The image of the whole view, with holes filled coarsely; `quick` fills them from their surroundings only."""
+        """The image of the whole view, with holes filled coarsely; from their surroundings only if `quick`."""
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
         return self.coarse(replace(view, error=view.holes.to(view.error)), sources).float()
@@ -252,7 +252,7 @@ class ViewSynthNet(Network):
     @torch.no_grad()
     @one_thread()
     def predict_depth(self, view: IncompleteView, context: ContextProvider) -> DepthMap | None:
-        """The depth of the subject on the proxy and its rim. Only the first half of the network runs: no blending."""
+        """The depth of the subject on the proxy and its rim. Runs the network up to the depth distribution."""
         sources = SourceCameras.closest_to(view, context, self.config.num_views)
         if sources is None:
             return None

@@ -1,4 +1,4 @@
-"""Fills holes pixel by pixel from the source cameras: the model `rays`, and the coarse fill of the default model.
+"""Fills holes pixel by pixel from the source cameras: the model `rays`, and a part of the default model.
 
 The true surface in a hole is at the proxy or behind it, and cameras that see it agree on its
 colour. So each missing pixel becomes a convex mix of candidates: the colours that the cameras have
@@ -247,7 +247,10 @@ def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pi
 def gather_ray_inputs(
     view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, smooth: Image | None = None
 ) -> RayInputs:
-    """The network's inputs for pixels (row, column) of a view; `smooth` is the view with E filled smoothly, if made."""
+    """The network's inputs for pixels (row, column) of a view.
+
+    `smooth` is the image with E filled smoothly, if the caller has it.
+    """
     if smooth is None:
         smooth = fill(view.rgb, view.error > 0, view.mask > 0)
     scale = SceneScale.of(view)

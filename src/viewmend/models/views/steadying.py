@@ -103,7 +103,7 @@ def steadying_change(now: Channels, before: Channels) -> Channels:
 
 
 def _part(difference: Channels, weight: float, similar: float) -> Channels:
-    """The part of a difference that is undone: nearly `weight` of small ones, little of those above `similar`."""
+    """The part of a difference to undo: nearly `weight` of small ones, little of those above `similar`."""
     largest = np.abs(difference).max(-1, keepdims=True)
     return weight * np.exp(-((largest / similar) ** 2)) * difference
 
