@@ -219,7 +219,7 @@ def test_a_camera_without_masks_is_not_used_and_named_once(plain, capsys, caplog
     capture = open_capture(plain.path)
     assert capture.unmasked == ("b",) and capture.cameras.names == ("a", "c", "d")
     assert capture.read(0).cameras.names == ("a", "c", "d") and not capture.gaps
-    assert "camera 'b' is not used: expected masks as the other cameras have, got none" in caplog.text
+    assert "camera 'b' is not used: expected masks, which the other cameras have, got none" in caplog.text
     assert main(["check", str(plain.path)]) == 0
     assert capsys.readouterr().out.count("'b'") == 1
     assert open_capture(plain.path, masks="none").cameras.names == ("a", "b", "c", "d")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from reference.films import SIZE, picture, write_film
 
-from viewmend.data.film_colours import BT2020, DISPLAY_P3, HLG, PQ, to_srgb
 from viewmend.data.video_clock import Timecode, Track, match_tracks, parse_timecode, video_track
+from viewmend.data.video_colours import BT2020, DISPLAY_P3, HLG, PQ, to_srgb
 from viewmend.data.videos import VideoFile, video_properties
 
 

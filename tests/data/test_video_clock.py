@@ -38,7 +38,7 @@ def test_a_camera_is_absent_where_it_lost_frames_and_in_step_afterwards():
     clock = match_tracks(tracks(a=range(9), b=lost, c=range(9)))
     assert clock.frames["b", "images"].tolist() == [0, 1, 2, 3, ABSENT, ABSENT, ABSENT, 4, 5]
     assert said(clock) == [
-        "the images of camera 'b' lack 3 frames from 0.13 s on, by the film's own times; the camera is absent there"
+        "the images of camera 'b' lack 3 frames from 0.13 s on, by the video's own times; the camera is absent there"
     ]
 
 

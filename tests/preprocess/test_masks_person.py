@@ -196,7 +196,7 @@ def test_a_camera_without_a_person_is_named_has_no_mask_and_is_not_used(half_bli
     printed = capsys.readouterr().out
     assert (
         printed.count("cam01") == 1
-        and "camera 'cam01' is not used: expected masks as the other cameras have" in printed
+        and "camera 'cam01' is not used: expected masks, which the other cameras have" in printed
     )
     assert "hull IoU  mean 0.9" in printed
     assert "a capture with 5 cameras" in printed

@@ -22,7 +22,10 @@ class CameraImages:
 
 
 def stack_images(images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
-    """Stack the images of several cameras, padded right and below; masks and depth only if all cameras have them."""
+    """Stack the images of several cameras, padded at the right and bottom.
+
+    Masks and depth are stacked only if all cameras have them.
+    """
     width, height = cameras.max_size_px
     have_masks = all(image.mask is not None for image in images)
     have_depth = all(image.depth is not None for image in images)

@@ -62,9 +62,9 @@ class CameraReader:
         }
 
     def _has_mask_per_image(self) -> bool:
-        """Whether mask files are numbered like the film's frames, not like the capture's.
+        """Whether mask files are numbered like the video's frames, not like the capture's.
 
-        That is so if there are fewer mask files than frames of the capture, but as many as the film has frames.
+        That is so if there are fewer mask files than frames of the capture, but as many as the video has frames.
         """
         if self._video is None or self.camera.mask is None or self._mask_video is not None:
             return False
@@ -83,7 +83,7 @@ class CameraReader:
     def read(self, time: int) -> CameraImages | None:
         """Read and undistort the images of the frame at index `time`, in which the camera is present.
 
-        None if its film is damaged there. CaptureError if a file is missing, unreadable, or not of
+        None if its video is damaged there. CaptureError if a file is missing, unreadable, or not of
         the camera's size.
         """
         camera = self.camera

@@ -53,7 +53,7 @@ def open_capture(
         path: the folder, or the file that stands for it, such as `cameras.json`.
         cameras: names of the cameras to use; all by default.
         format: name of the format; by default it is recognised.
-        masks: use the capture's own mask files, the alpha channel of its images, or no masks.
+        masks: whether to use the capture's own mask files, the alpha channel of its images, or no masks.
 
     Raises:
         CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see
@@ -80,9 +80,9 @@ def open_capture(
 
 
 def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
-    """Where the origin of a source's cameras and bounds lies in the coordinates of its own files, metres.
+    """The origin of a source's cameras and bounds, in the coordinates of its own files, metres.
 
-    It is 0 unless a `CaptureFolder` moved the origin (see its `origin_m`).
+    It is 0 unless a `CaptureFolder` moved the origin (`CaptureFolder.origin_m`).
     """
     while isinstance(source, CaptureWrapper):
         source = source.source
@@ -92,12 +92,15 @@ def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
 class CaptureFolder:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
-    A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by
-    the times of their frames. Images and masks are undistorted to pinhole images with the same K,
-    and padded right and below to the largest of the frame. The arguments are those of
-    `open_capture`, which logs `issues`. CaptureError if `cameras.json` is invalid; a camera has no
-    files in any frame, or a frame has no camera; only some cameras have masks or depth; a file lies
-    outside the folder; or a camera name is unknown.
+    A camera whose image or mask is missing in a frame is absent from that frame (a gap). Videos are
+    matched by the times of their frames. Images and masks are undistorted to pinhole images with the
+    same K, and padded at the right and bottom to the size of the largest image. The arguments are
+    those of `open_capture`, which logs `issues`.
+
+    Raises:
+        CaptureError: `cameras.json` is invalid, or a camera name is unknown. A camera has no files in
+            any frame, or a frame has no camera. Only some cameras have masks or depth. A file lies
+            outside the folder.
     """
 
     def __init__(
@@ -109,7 +112,8 @@ class CaptureFolder:
     ):
         path = path.parent if path.name == CALIBRATION and path.is_file() else path
         calibration = read_any_calibration(path, format)
-        self.folder = folder = calibration.folder
+        folder = calibration.folder
+        self.folder = folder
         self.name = path.stem if path.is_file() else folder.resolve().name
         """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
@@ -123,9 +127,10 @@ class CaptureFolder:
         self._entries = tuple(camera for camera in self._entries if camera.name not in self.unmasked)
         self.cameras = pinhole_cameras(self._entries)
         self.clock = read_clock(calibration)
-        """When the films' frames were taken; None for a capture of images."""
-        self.frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
-        self._listed = len(calibration.frames)
+        """When the videos' frames were taken; None for a capture of images."""
+        self._num_listed = len(calibration.frames)
+        num_frames = self._num_listed if self.clock is None else len(self.clock.times_s)
+        self.frame_ids = calibration.frames[:num_frames]
         self.fps = calibration.fps
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
         corners = calibration.bounds_m
@@ -133,19 +138,19 @@ class CaptureFolder:
             None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
         )
         self.origin_m = calibration.origin_m
-        """Where the origin of `cameras` and `bounds` lies in the folder's coordinates, metres, 64 bits. It is
-        moved to the cameras if they are so far from the folder's origin that 32 bits are too coarse."""
+        """The origin of `cameras` and `bounds`, in the coordinates of the folder's files, metres, 64 bits. It
+        is a point near the cameras if they are too far from the files' origin for 32 bits, else 0."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
-        self.has_masks = self._all_or_none("mask")
-        self.has_depth = self._all_or_none("depth")
+        self.has_masks = self._cameras_have("mask")
+        self.has_depth = self._cameras_have("depth")
         self._readers = tuple(
             CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries
         )
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
         self._label_masks = LabelMasks()
-        self._warned_of_labels: set[str] = set()
+        self._logged_conversions: set[str] = set()
 
     @property
     def gaps(self) -> tuple[tuple[str, str], ...]:
@@ -155,26 +160,27 @@ class CaptureFolder:
 
     @property
     def issues(self) -> tuple[Issue, ...]:
-        """Cameras without masks, and films whose times differ from the others'."""
-        unused = ()
+        """Cameras without masks, and videos whose times differ from the others'."""
+        issues: list[Issue] = []
         if self.unmasked:
             names = ", ".join(f"'{name}'" for name in self.unmasked)
-            who = f"cameras {names} are" if len(self.unmasked) > 1 else f"camera {names} is"
-            unused = (Issue(f"{who} not used: expected masks as the other cameras have, got none; add them"),)
-        if self.clock is None:
-            return unused
-        listed = self._listed
-        found = len(self.frame_ids)
-        text = (
-            f"expected {listed} frames as listed, got videos with {found} common times; "
-            "the other frames are left out"
-        )
-        return unused + ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
+            unused = f"cameras {names} are" if len(self.unmasked) > 1 else f"camera {names} is"
+            issues.append(
+                Issue(f"{unused} not used: expected masks, which the other cameras have, got none; add them")
+            )
+        if self.clock is not None:
+            found = len(self.frame_ids)
+            if found < self._num_listed:
+                expected = f"{self._num_listed} frames as listed"
+                got = f"videos with {found} common times"
+                issues.append(Issue(f"expected {expected}, got {got}; the other frames are left out"))
+            issues.extend(self.clock.issues(self.cameras.names))
+        return tuple(issues)
 
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
 
-        A camera whose film is damaged at this time is absent. Masks are 0 in a frame without a
+        A camera whose video is damaged at this time is absent. Masks are 0 in a frame without a
         subject. CaptureError if a file is unreadable or has the wrong size; IndexError if `time` is
         not in the capture.
         """
@@ -186,7 +192,7 @@ class CaptureFolder:
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
             images = list(pool.map(lambda view: self._readers[view].read(time), views))
-        self._warn_of_rotation()
+        self._warn_about_rotation()
         views = [view for view, image in zip(views, images, strict=True) if image is not None]
         if not views:
             raise CaptureError(
@@ -207,20 +213,25 @@ class CaptureFolder:
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
     def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """The frame with masks up to 255. Converts those of class labels or low grey levels, and logs this once."""
-        assert frame.mask is not None
-        found = self._label_masks.convert(frame.mask)
-        if found is None:
-            return frame
-        named = ", ".join(frame.cameras.names[view] for view in found.views or ())
-        whose = "masks" if found.views is None else f"masks of {named}"
-        if whose not in self._warned_of_labels:
-            self._warned_of_labels.add(whose)
-            text = f"{self.name}: {whose} have no values above {found.highest}: {found.reading}"
-            logging.getLogger("viewmend").warning(text)
-        return replace(frame, mask=found.mask)
+        """The frame with opaque masks: those with class labels or low grey levels are converted to 0 and 255.
 
-    def _warn_of_rotation(self) -> None:
+        This is logged at the first frame for the same cameras.
+        """
+        assert frame.mask is not None
+        converted = self._label_masks.convert(frame.mask)
+        if converted is None:
+            return frame
+        cameras = ", ".join(frame.cameras.names[view] for view in converted.views or ())
+        masks = "masks" if converted.views is None else f"masks of {cameras}"
+        if masks not in self._logged_conversions:
+            self._logged_conversions.add(masks)
+            logging.getLogger("viewmend").warning(
+                f"{self.name}: {masks} have no values above {converted.highest}: {converted.explanation}"
+            )
+        return replace(frame, mask=converted.mask)
+
+    def _warn_about_rotation(self) -> None:
+        """Log once which cameras have images that EXIF says to turn, which is not done."""
         rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
         if rotated:
             names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
@@ -231,7 +242,8 @@ class CaptureFolder:
         for reader in rotated:
             reader.warned = True
 
-    def _all_or_none(self, kind: FileKind) -> bool:
+    def _cameras_have(self, kind: FileKind) -> bool:
+        """Whether the cameras have files of this kind; CaptureError if some have and others do not."""
         missing = [f"camera '{camera.name}'" for camera in self._entries if getattr(camera, kind) is None]
         if missing and len(missing) < len(self._entries):
             expected = f"'{kind}' for every camera or for none"
@@ -257,8 +269,9 @@ class CaptureFolder:
         for camera, row in zip(self._entries, present, strict=True):
             if not row.any():
                 raise CaptureError(self._describe_unused_camera(camera, exists))
-        for time in np.flatnonzero(~present.any(0)).tolist():
-            raise CaptureError(self._describe_empty_frame(time, exists))
+        empty_frames = np.flatnonzero(~present.any(0)).tolist()
+        if empty_frames:
+            raise CaptureError(self._describe_empty_frame(empty_frames[0], exists))
         return present
 
     def _describe_unused_camera(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
@@ -281,17 +294,25 @@ class CaptureFolder:
 
     def _describe_empty_frame(self, time: int, exists: Callable[[str], bool]) -> str:
         """The error message for a frame in which no camera has all of its files."""
-        kinds: list[FileKind] = [
-            k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)
+        # The kinds of files that cameras have, and those of them that no camera has in this frame
+        readers = {kind: [r for r in self._readers if kind in r.camera.file_kinds] for kind in FILE_KINDS}
+        kinds: list[FileKind] = [kind for kind in FILE_KINDS if readers[kind]]
+        absent: list[FileKind] = [
+            kind for kind in kinds if all(reader.lacks(kind, time, exists) for reader in readers[kind])
         ]
-        own = {
-            kind: [reader for reader in self._readers if kind in reader.camera.file_kinds] for kind in kinds
-        }
-        absent: list[FileKind] = [k for k in kinds if all(reader.lacks(k, time, exists) for reader in own[k])]
-        first: FileKind = (absent or kinds)[0]
-        _, where = own[first][0].locate(first, time)
-        wanted = "this file or another camera's" if absent else f"{' and '.join(kinds)} of the same camera"
-        got = f"no {' and no '.join(absent)} of any camera" if absent else "no camera that has all"
+
+        # A missing file is named as an example
+        if absent:
+            example: FileKind = absent[0]
+            wanted = "this file or another camera's"
+            got = f"no {' and no '.join(absent)} of any camera"
+        else:
+            example = kinds[0]
+            wanted = f"{' and '.join(kinds)} of the same camera"
+            got = "no camera that has all"
+        _, where = readers[example][0].locate(example, time)
+
+        # What to do: the frame can be removed only where it is listed, or where its images make it a frame
         steps = ["add them, black ones if there is no subject" if absent == ["mask"] else "add them"]
         if self._file.name == CALIBRATION and self.clock is None:
             steps.append(f"remove the frame from {self._file}")
@@ -328,7 +349,8 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
     files = [folder / camera.file("image", frame) for frame in frames]
     existing = [file for file in files if file.is_file()]
     if existing and not any(uses_alpha(file) for file in files):
-        read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")  # raises the error
+        # It raises the error of an image without alpha, or of one that cannot be read
+        read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")
     return replace(camera, mask=camera.image)
 
 
@@ -345,26 +367,22 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 
 
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:
-    """Match the films of a capture by time; None if it has no films and no offsets.
+    """Match the videos of a capture by time; None if it has no videos and no offsets.
 
-    Numbered images count as films with the capture's frame rate, or else that of its first
-    film. CaptureError if a film cannot be decoded, no two show the same time, or offsets
-    lack a frame rate.
+    The numbered images of a camera count as a video, with the frame rate of the capture, or if it has
+    none, that of the first video. CaptureError if a video cannot be decoded, no two show the same
+    time, or there are offsets but no frame rate.
     """
     cameras = calibration.cameras
-    folder = calibration.folder
-    files = {
-        (c.name, kind): path
-        for c in cameras
-        for kind, path in (("images", c.video), ("masks", c.mask))
-        if path
-    }
-    films = {
-        key: folder / path for key, path in files.items() if is_video(path) and (folder / path).is_file()
-    }
-    if not films and not any(camera.offset_ms for camera in cameras):
+    videos: dict[tuple[str, str], Path] = {}
+    for camera in cameras:
+        for kind, path in (("images", camera.video), ("masks", camera.mask)):
+            file = calibration.folder / (path or "")
+            if path and is_video(path) and file.is_file():
+                videos[camera.name, kind] = file
+    if not videos and not any(camera.offset_ms for camera in cameras):
         return None
-    fps = calibration.fps or next((video_properties(path).fps for path in films.values()), None)
+    fps = calibration.fps or next((video_properties(file).fps for file in videos.values()), None)
     if fps is None:
         raise CaptureError(f"{calibration.file}: expected fps, which offset_ms needs, got none; add it")
     numbers_s = np.arange(len(calibration.frames)) / fps
@@ -372,9 +390,9 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     for camera in cameras:
         offset_s = camera.offset_ms / 1000
         for kind in ("images", "masks"):
-            path = films.get((camera.name, kind))
-            if path is not None:
-                tracks.append(video_track(camera.name, kind, path, offset_s))
+            video = videos.get((camera.name, kind))
+            if video is not None:
+                tracks.append(video_track(camera.name, kind, video, offset_s))
             elif kind == "images":  # numbered masks follow their images
                 tracks.append(Track(camera.name, kind, numbers_s, fps, offset_s))
     try:

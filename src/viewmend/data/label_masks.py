@@ -40,8 +40,8 @@ class ConvertedMasks:
     """The views whose masks were converted; None for all."""
     highest: int
     """The highest value of these masks before."""
-    reading: str
-    """How the masks are read, for a message."""
+    explanation: str
+    """How the masks were converted, for a message."""
 
 
 class LabelMasks:

@@ -36,6 +36,8 @@ Matrix = tuple[Triple, Triple, Triple]
 
 
 class _CameraEntry(Struct, frozen=True, kw_only=True):
+    """An entry of `cameras` in a `cameras.json`."""
+
     name: Text
     width: Pixels
     height: Pixels
@@ -74,7 +76,9 @@ class _CameraEntry(Struct, frozen=True, kw_only=True):
                 raise _invalid(kind, "a path inside the capture folder", shown(path), next_step)
 
 
-class _File(Struct, frozen=True, kw_only=True):
+class _Content(Struct, frozen=True, kw_only=True):
+    """The content of a `cameras.json`."""
+
     format: str
     first_pixel_center: tuple[Number, Number] = (0.0, 0.0)
     metres_per_unit: Positive = 1.0
@@ -101,7 +105,7 @@ class _File(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class NativeCamera:
-    """One camera of a calibration, for images before undistortion."""
+    """One camera of a calibration, with the lens distortion of its images."""
 
     name: str
     width: int
@@ -111,19 +115,23 @@ class NativeCamera:
     R: Float64[np.ndarray, "3 3"]
     """Rotation of camera_from_world, exactly orthonormal."""
     t_m: Float64[np.ndarray, "3"]
-    """Translation of camera_from_world."""
+    """Translation of camera_from_world, metres."""
     dist: Float64[np.ndarray, "5"]
     """Brown-Conrady coefficients k1 k2 p1 p2 k3, in OpenCV's order."""
     image: str | None
+    """Path of its images in the capture's folder, with {frame} for the frame id; None if it has a video."""
     video: str | None
+    """Path of its video; None if it has images."""
     mask: str | None
+    """Path of its masks, as for images, or of a video of masks; None if it has none."""
     depth: str | None
+    """Path of its depth images, as for images; None if it has none."""
     colour: Float64[np.ndarray, "3 3"] | None = None
     """Coefficients a, b, c of red, green and blue: a value x in 0..255 becomes a x^2 + b x + c."""
     mask_labels: bool = False
     """Whether mask values are labels, of which only 0 is background."""
     offset_ms: float = 0.0
-    """Subtracted from the times of the camera's frames."""
+    """How far the camera's clock is ahead: this is subtracted from the times of its frames."""
 
     @property
     def file_kinds(self) -> tuple[FileKind, ...]:
@@ -131,7 +139,7 @@ class NativeCamera:
         return tuple(kind for kind in FILE_KINDS if getattr(self, kind) is not None)
 
     def file(self, kind: FileKind, frame: str) -> str:
-        """Path of one file of this frame, relative to the capture. The camera must have files of that kind."""
+        """Path of its file for this frame, in the capture's folder. It must have files of that kind."""
         pattern = getattr(self, kind)
         assert isinstance(pattern, str), f"camera {self.name} has no {kind}"
         return pattern.replace("{frame}", frame)
@@ -149,12 +157,12 @@ class NativeCalibration:
     bounds_m: Float64[np.ndarray, "2 3"] | None
     metres_per_unit: float
     file: Path
-    """The file that it was read from."""
+    """The file that the calibration was read from."""
     folder: Path
-    """The folder that the cameras' paths are relative to."""
+    """The capture's folder, which the paths of the cameras' files are relative to."""
     origin_m: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """The origin of this calibration, in the coordinates of the file. It is 0 unless the cameras
-    are far from the file's origin, as in survey coordinates: then it is a point near the cameras."""
+    are far from the file's origin, as in survey coordinates. Then it is a point near the cameras."""
 
 
 def read_calibration(folder: Path) -> NativeCalibration:
@@ -181,16 +189,19 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
     """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
-    file = typed({"format": FORMAT, **read_json(json.dumps(content))}, _File)
-    shift_px = 0.5 - np.array(file.first_pixel_center)
-    up = None if file.up is None else np.array(file.up)
+    # Content that was made from another format passes through JSON, so that it is checked as a file's is
+    as_read = read_json(json.dumps(content))
+    checked = typed({"format": FORMAT, **as_read}, _Content)
+    shift_px = 0.5 - np.array(checked.first_pixel_center)
+    unit_m = checked.metres_per_unit
+    up = None if checked.up is None else np.array(checked.up)
     calibration = NativeCalibration(
-        frames=file.frames,
-        cameras=tuple(_camera(entry, shift_px, file.metres_per_unit) for entry in file.cameras),
+        frames=checked.frames,
+        cameras=tuple(_camera(entry, shift_px, unit_m) for entry in checked.cameras),
         up=None if up is None else up / np.linalg.norm(up),
-        fps=file.fps,
-        bounds_m=None if file.bounds is None else np.array(file.bounds) * file.metres_per_unit,
-        metres_per_unit=file.metres_per_unit,
+        fps=checked.fps,
+        bounds_m=None if checked.bounds is None else np.array(checked.bounds) * unit_m,
+        metres_per_unit=unit_m,
         file=path,
         folder=path.parent,
     )
@@ -198,36 +209,40 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
 
 
 def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
-    """A point of round coordinates near the cameras; 0 if they are near enough to 0 for 32-bit numbers."""
+    """The rounded middle of the cameras; 0 if they are near enough to 0 for 32-bit numbers.
+
+    It is a multiple of the power of ten that is closest above the extent of the rig.
+    """
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
     extent_m = float((centers_m.max(0) - centers_m.min(0)).max())
-    if not np.isfinite(middle_m).all() or np.abs(middle_m).max() <= FAR * extent_m or extent_m == 0:
+    is_valid = extent_m > 0 and bool(np.isfinite(middle_m).all())
+    if not is_valid or np.abs(middle_m).max() <= FAR * extent_m:
         return np.zeros(3)
-    step_m = 10.0 ** np.ceil(np.log10(extent_m))
-    return np.rint(middle_m / step_m) * step_m
+    unit_m = 10.0 ** np.ceil(np.log10(extent_m))
+    return np.rint(middle_m / unit_m) * unit_m
 
 
 def moved_to(calibration: NativeCalibration, origin_m: Float64[np.ndarray, "3"]) -> NativeCalibration:
     """The same calibration relative to another origin, which is given in the coordinates of the file."""
-    step_m = origin_m - calibration.origin_m
-    if not step_m.any():
+    shift_m = origin_m - calibration.origin_m
+    if not shift_m.any():
         return calibration
-    cameras = tuple(replace(camera, t_m=camera.t_m + camera.R @ step_m) for camera in calibration.cameras)
-    bounds_m = None if calibration.bounds_m is None else calibration.bounds_m - step_m
+    cameras = tuple(replace(camera, t_m=camera.t_m + camera.R @ shift_m) for camera in calibration.cameras)
+    bounds_m = None if calibration.bounds_m is None else calibration.bounds_m - shift_m
     return replace(calibration, cameras=cameras, bounds_m=bounds_m, origin_m=origin_m)
 
 
 def exact_pose(
     R: Float64[np.ndarray, "3 3"], t: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
-    """The nearest rotation to a rounded one, and the translation with which the camera keeps its position."""
+    """The rotation that is nearest to a rounded one, and the translation that keeps the camera's position."""
     u, _, vt = np.linalg.svd(R)
     center = -np.linalg.solve(R, t)
     return u @ vt, -(u @ vt) @ center
 
 
-def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
+def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], unit_m: float) -> NativeCamera:
     K = np.array(entry.K)
     K[:2, 2] += shift_px
     R, t = exact_pose(np.array(entry.R), np.array(entry.t))
@@ -237,7 +252,7 @@ def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: floa
         height=entry.height,
         K=K,
         R=R,
-        t_m=t * scale,
+        t_m=t * unit_m,
         dist=np.array(entry.dist),
         image=_with_slashes(entry.image),
         video=_with_slashes(entry.video),
@@ -250,14 +265,14 @@ def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: floa
 
 
 def _with_slashes(path: str | None) -> str | None:
-    """The path with `/` between its parts, as it may have been written on Windows."""
+    """The path with `/` between its parts, where it may have the backslashes of Windows."""
     return None if path is None else path.replace("\\", "/")
 
 
 def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
-    """Write a `cameras.json` that reads back as this calibration, in the coordinates of the file that it came from.
+    """Write a `cameras.json` that reads back as this calibration.
 
-    File paths are kept as they are.
+    Positions are written in the coordinates of `calibration.file`, and file paths as they are.
     """
     calibration = moved_to(calibration, np.zeros(3))
     content = {
@@ -297,7 +312,7 @@ def _check_keys(content: dict[str, Any]) -> None:
         raise _invalid(
             "format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it"
         )
-    _check_spelling(content, _File.__struct_fields__)
+    _check_spelling(content, _Content.__struct_fields__)
     cameras = content.get("cameras")
     if isinstance(cameras, list):
         for entry in cameras:

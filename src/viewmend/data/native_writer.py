@@ -37,7 +37,7 @@ def write_capture(
     *,
     images: Literal["jpeg", "png"] = "jpeg",
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
-    unmasked: Callable[[int], MultiViewFrame | None] | None = None,
+    read_unmasked: Callable[[int], MultiViewFrame | None] | None = None,
 ) -> tuple[int, ...]:
     """Write all frames of a source to the folder `out`: images, masks and depth if present, and `cameras.json`.
 
@@ -51,8 +51,8 @@ def write_capture(
         out: a new or empty folder.
         images: the format of the camera images.
         progress: wraps the frame indices while they are iterated over, as a progress bar does.
-        unmasked: returns, for the index of a frame, the cameras that were left out of it because
-            they have no mask; their images are written, too.
+        read_unmasked: called with the index of each frame after it was read. Returns the images of
+            cameras that the frame lacks because they have no mask; these are written, too.
 
     Raises:
         CaptureError: `out` exists and is not empty, or the source cannot be read.
@@ -70,17 +70,18 @@ def write_capture(
     with atomic_folder(out) as unfinished:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")
         times = range(len(source.frame_ids))
-        return writer.write(times if progress is None else progress(times), unmasked)
+        return writer.write(times if progress is None else progress(times), read_unmasked)
 
 
 @contextmanager
 def atomic_folder(out: Path | str) -> Iterator[Path]:
-    """Yield the path of a temporary folder, to be created and filled, which becomes `out` at the end.
+    """Yield the path of a temporary folder. The caller creates and fills it; on exit it is renamed to `out`.
 
     So `out` is complete or absent. CaptureError if it exists and is not an empty folder.
     """
     out = Path(out)
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+    is_empty_folder = out.is_dir() and not any(out.iterdir())
+    if out.exists() and not is_empty_folder:
         raise CaptureError(
             f"{out}: expected a new or empty folder, got one in use; remove it or choose another"
         )
@@ -99,10 +100,11 @@ def atomic_folder(out: Path | str) -> Iterator[Path]:
 
 
 def remove_unfinished(out: Path) -> None:
-    """Remove temporary folders of `out` that killed processes have left."""
-    for left in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
-        if not is_running(left.name.rpartition("-")[2]):
-            shutil.rmtree(left, ignore_errors=True)
+    """Remove temporary folders of `out` that processes left behind when they were killed."""
+    for folder in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
+        _, _, process_id = folder.name.rpartition("-")
+        if not is_running(process_id):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 class _Writer:
@@ -113,11 +115,14 @@ class _Writer:
         self.folder = folder
         self.suffix = suffix
         self.kinds: set[FileKind] = {"image"}
+        """Kinds of files that were written."""
         self.masked: set[str] = set()
+        """Names of cameras with a mask in any frame."""
         names = source.cameras.names
         self.folder_names = {name: _folder_name(name, index) for index, name in enumerate(names)}
+        # Names that differ in case only are one folder on some systems, so all folders get numbers instead
         if len({name.lower() for name in self.folder_names.values()}) < len(names):
-            self.folder_names = {name: _folder_name("", index) for index, name in enumerate(names)}
+            self.folder_names = {name: _numbered_folder(index) for index, name in enumerate(names)}
         unsafe = [frame for frame in source.frame_ids if not stays_inside(frame)]
         if unsafe:
             expected = "frame ids that can be file names"
@@ -125,16 +130,16 @@ class _Writer:
         folder.mkdir()
 
     def write(
-        self, times: Iterable[int], unmasked: Callable[[int], MultiViewFrame | None] | None = None
+        self, times: Iterable[int], read_unmasked: Callable[[int], MultiViewFrame | None] | None = None
     ) -> tuple[int, ...]:
         """Write these frames; arguments and return value are those of `write_capture`."""
         empty = []
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             for frame in prefetch(self.source, times):
                 self._write_frame(frame, pool)
-                left_out = None if unmasked is None else unmasked(frame.time)
-                if left_out is not None:
-                    self._write_frame(left_out, pool)
+                unmasked = None if read_unmasked is None else read_unmasked(frame.time)
+                if unmasked is not None:
+                    self._write_frame(unmasked, pool)
                 if frame.mask is not None and not frame.has_subject:
                     empty.append(frame.time)
         write_calibration(self.folder, self._calibration())
@@ -143,7 +148,7 @@ class _Writer:
     def _write_frame(self, frame: MultiViewFrame, pool: ThreadPoolExecutor) -> None:
         """Write the images of all cameras of a frame, in parallel."""
         written = pool.map(lambda view: self._write_view(frame, view), range(len(frame.cameras)))
-        list(written)  # waits, and raises their errors
+        list(written)  # waits for the threads, and raises their errors
 
     def _write_view(self, frame: MultiViewFrame, view: int) -> None:
         name = frame.cameras.names[view]
@@ -152,7 +157,7 @@ class _Writer:
 
         def file(kind: FileKind) -> Path:
             self.kinds.add(kind)
-            return self.folder / self._path(name, kind).replace("{frame}", frame_id)
+            return self.folder / self._pattern(name, kind).replace("{frame}", frame_id)
 
         write_image(
             file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
@@ -163,13 +168,17 @@ class _Writer:
         if frame.depth is not None:
             write_depth(file("depth"), frame.depth[view, :height, :width].float().contiguous().cpu().numpy())
 
-    def _path(self, camera: str, kind: FileKind) -> str:
-        return f"{kind}/{self.folder_names[camera]}/{{frame}}{self.suffix if kind == 'image' else '.png'}"
+    def _pattern(self, camera: str, kind: FileKind) -> str:
+        """Path of a camera's files of this kind, with {frame} for the frame id."""
+        suffix = self.suffix if kind == "image" else ".png"
+        return f"{kind}/{self.folder_names[camera]}/" + "{frame}" + suffix
 
     def _calibration(self) -> NativeCalibration:
         source = self.source
-        bounds = self.source.bounds
-        cameras = self.source.cameras.to("cpu")
+        bounds = None
+        if source.bounds is not None:
+            bounds = torch.stack([source.bounds.low, source.bounds.high]).double().cpu().numpy()
+        cameras = source.cameras.to("cpu")
         K = cameras.K.double().numpy()
         pose = cameras.camera_from_world.double().numpy()
         entries = []
@@ -177,7 +186,7 @@ class _Writer:
             zip(cameras.names, cameras.size_px.tolist(), strict=True)
         ):
             kinds = self.kinds if name in self.masked else self.kinds - {"mask"}
-            files: Any = {kind: self._path(name, kind) if kind in kinds else None for kind in FILE_KINDS}
+            files: Any = {kind: self._pattern(name, kind) if kind in kinds else None for kind in FILE_KINDS}
             R, t_m = exact_pose(pose[view, :3, :3], pose[view, :3, 3])
             entries.append(NativeCamera(name, width, height, K[view], R, t_m, np.zeros(5), **files))
         return NativeCalibration(
@@ -185,9 +194,7 @@ class _Writer:
             cameras=tuple(entries),
             up=None if source.up is None else source.up.double().cpu().numpy(),
             fps=source.fps,
-            bounds_m=None
-            if bounds is None
-            else torch.stack([bounds.low, bounds.high]).double().cpu().numpy(),
+            bounds_m=bounds,
             metres_per_unit=1.0,
             file=self.folder / CALIBRATION,
             folder=self.folder,
@@ -198,4 +205,8 @@ class _Writer:
 def _folder_name(camera: str, index: int) -> str:
     """The camera's name if it is a valid folder name on every system, else one with its number."""
     valid = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*[A-Za-z0-9_-]|[A-Za-z0-9]", camera)
-    return camera if valid else f"camera{index:02d}"
+    return camera if valid else _numbered_folder(index)
+
+
+def _numbered_folder(index: int) -> str:
+    return f"camera{index:02d}"

@@ -1,4 +1,4 @@
-"""One clock for all films of a capture: which frame of each film shows what the others show at the same time."""
+"""One clock for all videos of a capture: which frames of the videos show the same time."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -13,7 +13,7 @@ from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.videos import video_properties
 
 ABSENT = -1
-"""Stands for the frame of a film that has none at a time."""
+"""This index stands for the missing frame of a video that has none at a time."""
 TOLERANCE = 0.5
 """A frame belongs to a time that is at most this many frame periods from it."""
 NEW_TIME = 0.75
@@ -24,7 +24,7 @@ SAME_PHASE = 0.5
 """Frames keep a constant distance to the times if the mean of their unit phasors is this long."""
 RATE_TOLERANCE = 0.02
 NOTEWORTHY = 0.05
-"""Films that differ in length by a smaller share are not mentioned."""
+"""Videos that differ in length by a smaller share are not mentioned."""
 MAX_NAMED = 3
 DAY_S = 86400.0
 """Timecodes start again at midnight, seconds."""
@@ -39,25 +39,25 @@ class Timecode:
     frames: int
     """Frames since midnight."""
     rate: int
-    """Frames in a second of the count, such as 30 for films of 29.97 frames per second."""
+    """Frames in a second of the count, such as 30 for videos of 29.97 frames per second."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """When the frames of a film were taken, or those of a camera's numbered images."""
+    """When the frames of a video, or a camera's numbered images, were taken."""
 
     camera: str
     kind: TrackKind
     times_s: Float64[np.ndarray, "frame"]
-    """Increasing, by the film's own clock."""
+    """Increasing, by the video's own clock."""
     fps: float | None
     """Frames per second, gaps aside; None for a single frame."""
     offset_s: float = 0.0
     """How far the camera's clock is ahead of the others'."""
     is_timed: bool = True
-    """Whether the film stores its times; if not, they follow from an assumed rate."""
+    """Whether the video stores its times; if not, they follow from an assumed rate."""
     timecode: Timecode | None = None
-    """The recorder's clock at the film's time 0; None if the film has no timecode."""
+    """The recorder's clock at the video's time 0; None if the video has no timecode."""
 
     @property
     def gaps(self) -> list[tuple[float, int]]:
@@ -72,7 +72,7 @@ class Track:
 
 
 def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0) -> Track:
-    """The track of a film; CaptureError if it cannot be decoded."""
+    """The track of a video; CaptureError if it cannot be decoded."""
     try:
         video = video_properties(path)
     except CaptureError as error:
@@ -84,7 +84,7 @@ def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0)
 
 
 def parse_timecode(text: str, fps: float) -> Timecode | None:
-    """A timecode HH:MM:SS:FF, or with a semicolon in drop-frame counting, of a film of this rate; None for others."""
+    """Parse the timecode of a video: HH:MM:SS:FF, or HH:MM:SS;FF in drop-frame counting; None for other text."""
     parts = re.fullmatch(r"(\d+):(\d+):(\d+)([:;.,])(\d+)", text.strip())
     if parts is None:
         return None
@@ -99,25 +99,25 @@ def parse_timecode(text: str, fps: float) -> Timecode | None:
 
 @dataclass(frozen=True)
 class VideoClock:
-    """The times of a capture, and the frame of each film at each of them."""
+    """The times of a capture, and the frame of each video at each of them."""
 
     tracks: tuple[Track, ...]
-    """The films; offsets are already subtracted from their times."""
+    """The videos; offsets are already subtracted from their times."""
     reference_fps: float | None
-    """Frames per second of the film that sets the times; at least half of the cameras are as fast."""
+    """Frames per second of the video that sets the times; at least half of the cameras are as fast."""
     times_s: Float64[np.ndarray, "time"]
     """When two cameras or more have all of their frames."""
     end: int
-    """How many of the times lie before the end of the shortest film."""
+    """How many of the times lie before the end of the shortest video."""
     frames: Mapping[tuple[str, TrackKind], Int[np.ndarray, "time"]]
-    """Index of each film's frame at each time; `ABSENT` without one."""
+    """Index of each video's frame at each time; `ABSENT` without one."""
     moved: frozenset[tuple[str, TrackKind]]
-    """Films that had no time in common with the others, and were moved to start together with them."""
+    """Videos that had no time in common with the others, and were moved to start together with them."""
     by_index: frozenset[str]
     """Cameras whose masks have other times, but as many frames as their images, and were matched
     one to one."""
     timecodes: str | None = None
-    """A note if the films' timecodes give them different starts: how different, and whether they were used."""
+    """A note if the videos start at different timecodes: how different, and whether they were used."""
 
     @property
     def fps(self) -> float | None:
@@ -130,7 +130,7 @@ class VideoClock:
         return rate if rate is not None and abs(mean / rate - 1) < RATE_TOLERANCE else round(mean, 3)
 
     def describe(self, camera: str) -> list[dict[str, Any]]:
-        """Rate, length, gaps and offset of a camera's films, for `viewmend check`."""
+        """Rate, length, gaps and offset of each of a camera's videos, for `viewmend check`."""
         return [
             {
                 "kind": track.kind,
@@ -146,7 +146,7 @@ class VideoClock:
         ]
 
     def issues(self, cameras: Sequence[str]) -> tuple[Issue, ...]:
-        """What is wrong with the times of these cameras' films; one issue for all cameras with the same fault."""
+        """Faults of the times of these cameras' videos; one issue for all cameras with the same fault."""
         faults: dict[str, list[str]] = {}
         for track in self.tracks:
             if track.camera in cameras:
@@ -156,7 +156,7 @@ class VideoClock:
         return found if self.timecodes is None else (Issue(self.timecodes), *found)
 
     def _faults(self, track: Track) -> list[str]:
-        """The faults of a film, with {} for the camera."""
+        """The faults of a video, with {} for the camera."""
         images = [other for other in self.tracks if other.kind == "images"]
         rate = self.reference_fps or 1.0
         what = f"the {track.kind} of {{}}"
@@ -196,7 +196,7 @@ class VideoClock:
             lost = sum(count for _, count in track.gaps)
             from_s = track.gaps[0][0]
             text = f"{what} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"
-            faults.append(f"{text}, by the film's own times; the camera is absent there")
+            faults.append(f"{text}, by the video's own times; the camera is absent there")
         start_s, end_s = _extent(images)
         late_s = float(track.times_s[0]) - start_s
         early_s = end_s - _extent([track])[1]
@@ -216,7 +216,7 @@ def own_fps(track: Track) -> float:
 
 
 def _extent(tracks: Sequence[Track]) -> tuple[float, float]:
-    """When the first of some films starts, and the last one ends."""
+    """The start of the first of these tracks and the end of the last one, seconds."""
     ends = [float(track.times_s[-1]) + (1 / track.fps if track.fps else 0.0) for track in tracks]
     return min(float(track.times_s[0]) for track in tracks), max(ends)
 
@@ -228,9 +228,9 @@ def _named(cameras: list[str]) -> str:
 
 
 def match_tracks(tracks: Sequence[Track]) -> VideoClock:
-    """Match films by time. A film of the rate that at least half of the cameras have sets the times.
+    """Match videos by time. A video of the rate that at least half of the cameras have sets the times.
 
-    Other films fill its gaps. Films of its rate that run with a constant distance of less than a
+    Other videos fill its gaps. Videos of its rate that run with a constant distance of less than a
     frame are matched one to one, and so are masks with as many frames as their images. ValueError
     if no two cameras share a time.
     """
@@ -267,7 +267,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
 
 
 def _choose_reference(images: Collection[Track]) -> Track:
-    """The longest film of the highest rate that at least half of the cameras reach."""
+    """The longest video of the highest rate that at least half of the cameras reach."""
     order = sorted(images, key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
     rate = round(order[len(order) // 2].fps or 0.0, 1)
     return next(track for track in order if round(track.fps or 0.0, 1) == rate)
@@ -276,9 +276,9 @@ def _choose_reference(images: Collection[Track]) -> Track:
 def _overlap(
     tracks: Sequence[Track], images: Mapping[str, Track], reference: Track
 ) -> tuple[list[Track], frozenset[tuple[str, TrackKind]], frozenset[str]]:
-    """Move films that have no time in common with the others to start with them; masks follow their images.
+    """Move videos that have no time in common with the others, to start with them; masks follow their images.
 
-    Returns the films, those that were moved, and the cameras whose masks were matched to the images
+    Returns the videos, those that were moved, and the cameras whose masks were matched to the images
     one to one.
     """
     period_s = 1 / (reference.fps or 1.0)
@@ -309,7 +309,7 @@ def _fill_gaps(
     centred: Sequence[Float64[np.ndarray, "_frame"]],
     period_s: float,
 ) -> Float64[np.ndarray, "new_time"]:
-    """Add the times of images that are far from all times so far; `centred` are the films' times."""
+    """Add the times of images that are far from all times so far; `centred` are the videos' times."""
     for track, own in zip(tracks, centred, strict=True):
         if track.kind == "images":
             far = np.abs(own - times_s[_nearest(times_s, own)]) > NEW_TIME * period_s
@@ -332,9 +332,9 @@ def _with_known_rates(tracks: Sequence[Track]) -> list[Track]:
 def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
     """The tracks at the times of their recorders' clocks, and what was found; unchanged if these do not fit together.
 
-    All films of images need a timecode, and there has to be a time at which all of them run.
+    All videos of images need a timecode, and there has to be a time at which all of them run.
     """
-    films = [track for track in tracks if track.kind == "images"]
+    image_tracks = [track for track in tracks if track.kind == "images"]
     clocks_s = _clocks_s(tracks)
     starts = {name: start_s for (name, kind), start_s in clocks_s.items() if kind == "images"}
     if len(starts) < 2:
@@ -344,19 +344,19 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
     first = min(starts, key=starts.__getitem__)
     last = max(starts, key=starts.__getitem__)
     apart_s = starts[last] - starts[first]
-    if apart_s * max(track.fps or 1.0 for track in films) < TOLERANCE:
+    if apart_s * max(track.fps or 1.0 for track in image_tracks) < TOLERANCE:
         return tracks, None
-    differ = f"the films' timecodes start up to {apart_s:.2f} s apart (first '{first}', last '{last}')"
-    without = [track.camera for track in films if track.camera not in starts]
+    differ = f"the videos' timecodes start up to {apart_s:.2f} s apart (first '{first}', last '{last}')"
+    without = [track.camera for track in image_tracks if track.camera not in starts]
     if without:
         return (
             tracks,
-            f"{differ}, but {_named(without)} has none; films are taken to start together, see offset_ms",
+            f"{differ}, but {_named(without)} has none; videos are taken to start together, see offset_ms",
         )
     shift = {name: start - starts[first] for name, start in starts.items()}
-    ends = [float(track.times_s[-1]) + shift[track.camera] for track in films]
-    if min(ends) < max(float(track.times_s[0]) + shift[track.camera] for track in films):
-        return tracks, f"{differ}, and there is no time at which all run; films are taken to start together"
+    ends = [float(track.times_s[-1]) + shift[track.camera] for track in image_tracks]
+    if min(ends) < max(float(track.times_s[0]) + shift[track.camera] for track in image_tracks):
+        return tracks, f"{differ}, and there is no time at which all run; videos are taken to start together"
     moved = []
     for track in tracks:
         from_s = shift[track.camera]
@@ -373,9 +373,9 @@ def _by_timecode(tracks: list[Track]) -> tuple[list[Track], str | None]:
 
 
 def _clocks_s(tracks: Sequence[Track]) -> dict[tuple[str, TrackKind], float]:
-    """The clock of each film with a timecode at its time 0, seconds since midnight.
+    """The clock of each video with a timecode at its time 0, seconds since midnight.
 
-    Films that count alike run at one rate: the smallest difference of measured rates would
+    Videos that count alike run at one rate: the smallest difference of measured rates would
     add up to seconds over the hours since midnight.
     """
     rates: dict[int, list[float]] = {}
@@ -397,7 +397,7 @@ def _nearest(
 
 
 def _phase_s(own: Float64[np.ndarray, "frame"], times: Float64[np.ndarray, "time"], period_s: float) -> float:
-    """The constant distance of a film's frames from the times, less than half a period; 0 if it is not constant."""
+    """The distance of a video's frames from the times, if constant and below half a period; 0 otherwise."""
     distances = own - times[_nearest(times, own)]
     mean = np.exp(2j * np.pi * distances[np.abs(distances) < period_s] / period_s)
     if not len(mean) or abs(mean.mean()) < SAME_PHASE:

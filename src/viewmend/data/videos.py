@@ -1,6 +1,6 @@
 """Video files: exact frames with their presentation times, and writing of MP4 and WebM.
 
-Captures and live rigs decode films here, so they see the same frames: upright, in the
+Captures and live rigs decode videos here, so they see the same frames: upright, in the
 colours that the file declares, at the times that it gives. What a container claims of
 length and rate is not trusted.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.film_colours import is_srgb, to_srgb
+from viewmend.data.video_colours import is_srgb, to_srgb
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -98,7 +98,7 @@ CHECKED_FRAMES = 8
 SEEK_FRAMES = 8
 """Fewer frames than this are decoded rather than skipped by seeking."""
 FIRST_FIELDS = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}
-"""The field that is shown first, by FFmpeg's code of a stream's field order. Frames of some H.264 films contradict it,
+"""The field that is shown first, by FFmpeg's code of a stream's field order. Frames of some H.264 videos contradict it,
 because their decoder takes the bottom field as the first where the stream does not say."""
 RATE_TOLERANCE = 0.01
 NO_CHROMA_FILTER = "POINT"
@@ -140,7 +140,7 @@ class VideoProperties:
     """Whether frames are made of two fields. They are read de-interlaced, at the time of their
     first field."""
     first_field: str = "auto"
-    """Which field of an interlaced film is shown first, as FFmpeg's filters name it: "tff" for the top one, "bff" for
+    """Which field of an interlaced video is shown first, as FFmpeg's filters name it: "tff" for the top one, "bff" for
     the bottom one, "auto" as each frame says."""
     timecode: str | None = None
     """The recorder's clock at the first frame, HH:MM:SS:FF, or HH:MM:SS;FF in drop-frame counting."""
@@ -206,7 +206,7 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
 
 
 def _timecode(container: "InputContainer", stream: "VideoStream") -> str | None:
-    """The timecode in the metadata of a film: of the container, else of its video, else of another stream."""
+    """The timecode in a file's metadata: of the container, else of the video stream, else of another one."""
     for place in (container, stream, *container.streams):
         for key, value in place.metadata.items():
             if key.lower() == "timecode":  # Matroska has capitals
@@ -309,7 +309,7 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
 
 
 def _progressive(video: VideoProperties, seek: int | None, threads: int) -> "Iterator[VideoFrame]":
-    """The decoded frames, de-interlaced if the film is interlaced."""
+    """The decoded frames, de-interlaced if the video is interlaced."""
     frames = _decoded(video.path, seek, threads)
     if not video.is_interlaced:
         return frames
@@ -324,7 +324,7 @@ def first_field_of(codec: "VideoCodecContext") -> str:
 def first_field_alone(frame: "VideoFrame", first_field: str = "auto") -> "VideoFrame":
     """A live stream's frame without its second field, whose rows are interpolated; itself if it is not interlaced.
 
-    Recorded films are interpolated from the frames before and after, too. A live picture would be late if it waited.
+    Recorded videos are interpolated from the frames before and after, too. A live picture would be late if it waited.
     """
     if not frame.interlaced_frame:
         return frame
@@ -462,7 +462,7 @@ def _skips(video: VideoProperties, at: int, index: int) -> bool:
 
 
 class VideoWriter:
-    """Writes a film of frames that all have the size of the first. A context manager.
+    """Writes a video of frames that all have the size of the first. A context manager.
 
     RGB becomes an H.264 MP4 that plays everywhere (4:2:0); an odd last row or column is dropped.
     RGB with `alpha` becomes a VP9 WebM, which browsers and editors composite. `threads` is the

@@ -413,8 +413,10 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     if not videos:
         return Footage(tuple(sorted(frozenset().union(*ids.values()), key=frame_order)), None, entries)
     tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
-    films = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
-    tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
+    for name in videos:
+        mask_path = str(entries[name].get("mask", ""))
+        if is_video(mask_path):
+            tracks.append(video_track(name, "masks", folder / mask_path))
     clock = match_tracks(tracks)
     return Footage(tuple(f"{time:06d}" for time in range(clock.end)), clock.fps, entries)
 

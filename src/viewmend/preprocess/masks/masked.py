@@ -143,8 +143,11 @@ class MaskedCapture(CaptureWrapper):
             frame = self._settled(frame)
         return frame if self.screens is None else _without_spill(frame, self.screens)
 
-    def unmasked(self, time: int) -> MultiViewFrame | None:
-        """The cameras of a frame, as last read, that should have a mask and have none; None without any."""
+    def take_unmasked(self, time: int) -> MultiViewFrame | None:
+        """The images of cameras that the frame, as last read, lacks because no mask could be made of them.
+
+        None without any. They are returned only once.
+        """
         return self._unmasked.pop(time, None)
 
     def _settled(self, frame: MultiViewFrame) -> MultiViewFrame:

@@ -1,4 +1,4 @@
-"""Conversion of a film's colours to sRGB, by the primaries and the transfer function that it declares.
+"""Conversion of a video's colours to sRGB, by the primaries and the transfer function that it declares.
 
 Phones record HDR (HLG or PQ with the primaries of BT.2020) by default. The numbers are ITU-T H.273's codes.
 """
