@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -75,8 +76,8 @@ def train(
     Raises:
         RunError: `out` holds a run with another config, or a damaged one.
         ValueError: another run is writing there, or `out` holds files that no run wrote.
-        FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is
-            not, and the last checkpoint was kept.
+        FloatingPointError: a loss is not finite (its batch was saved in `out`), or a weight is not
+            finite (the last checkpoint was kept).
     """
     with join_processes() as processes:
         claim = _claim(out) if processes.first else nullcontext()
@@ -98,6 +99,7 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
+        # Recorded before they exist, so that a run may replace the files of one that was killed
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)
@@ -125,9 +127,9 @@ class Processes:
         return Ddp(module, device_ids=devices, find_unused_parameters=True)
 
     def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
-        """The positions of the streams of all processes, in the order of the streams' numbers.
+        """The positions of the streams of all processes, by number, given those of this process.
 
-        Stream n belongs to process n % count.
+        A stream of samples can be resumed at its position. Stream n belongs to process n % count.
         """
         own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
         if self.count == 1:
@@ -147,7 +149,7 @@ class Processes:
         return value / self.count
 
     def maximum(self, *values: float) -> list[float]:
-        """The maximum of each value over the processes, whose clocks may differ."""
+        """The maximum of each value over the processes, so that they decide alike if their clocks differ."""
         if self.count == 1:
             return list(values)
         own = torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -176,6 +178,16 @@ def join_processes() -> Iterator[Processes]:
         torch.distributed.destroy_process_group()
 
 
+class Pace(NamedTuple):
+    """How fast a run is."""
+
+    samples_per_s: float
+    waiting: float
+    """Fraction of the time that was spent waiting for samples."""
+    eta_s: float
+    """Estimated time to the end."""
+
+
 class RunClock:
     """The times of a run: how far it is, how fast, and when the next checkpoint is due."""
 
@@ -184,7 +196,9 @@ class RunClock:
         self.config = config
         self.first_step = step
         self.before_s = elapsed_s
-        self._began = self._saved = time.monotonic()
+        now = time.monotonic()
+        self._began = now
+        self._saved = now
         self._samples = 0
         self._waited_s = 0.0
 
@@ -210,22 +224,19 @@ class RunClock:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Count the time within as waiting for samples."""
+        """Count the time spent in the `with` block as waiting for samples."""
         began = time.monotonic()
         yield
         self._waited_s += time.monotonic() - began
 
-    def pace(self, step: int, samples: int) -> tuple[float, float, float]:
-        """Samples per second, fraction of time waited, and seconds left, after `step` steps.
-
-        `samples` is the number of samples of the last step.
-        """
+    def pace(self, step: int, samples: int) -> Pace:
+        """The pace after `step` steps, the last of which had this number of samples."""
         self._samples += samples
         span_s = max(time.monotonic() - self._began, 1e-9)
         left_s = (self.config.steps - step) * span_s / (step - self.first_step)
         if self.config.minutes:
             left_s = min(left_s, 60 * self.config.minutes - self.elapsed_s())
-        return self._samples / span_s, self._waited_s / span_s, max(0.0, left_s)
+        return Pace(self._samples / span_s, self._waited_s / span_s, max(0.0, left_s))
 
 
 class Run:
@@ -239,16 +250,17 @@ class Run:
         self.config = config
         self.out = out
         self.processes = processes
-        make_objective = config.objective.make_objective
         run_config = _with_precision(config, processes.device)
-        self.objective = make_objective(run_config, config.objective, start).to(processes.device)
+        objective = config.objective.make_objective(run_config, config.objective, start)
+        self.objective = objective.to(processes.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = self.objective.make_optimizer(self.trained, config.learning_rate)
         self.adversary = self.objective.adversary
         self.state = RunState(step=0, elapsed_s=0.0, positions=())
-        self.validated: dict[str, float | None] = {}
+        self.last_scores: dict[str, float | None] = {}
+        """Scores of the latest validation; {} before the first."""
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
         if self.adversary is not None:
@@ -271,21 +283,22 @@ class Run:
         step = first
         clock = RunClock(config, first, self.state.elapsed_s)
         with Log(self.out, first, self.processes.first) as log:
-            # The starting weights are scored if they may be kept as the best, or if gains over them
-            # are reported.
-            compares_start = self.keeps_best or self.objective.compares_seen
-            if step == 0 and self.validation is not None and compares_start:
+            # The starting weights are scored if they may be the best, or to compare later scores with theirs
+            scores_start = self.keeps_best or self.objective.scores_training_views
+            if step == 0 and self.validation is not None and scores_start:
                 self._validate(log, step)
             while True:
+                # One process that is done ends the run for all, and one that wants a checkpoint makes all save
                 ends_now = stopped() or self._has_stopped_improving(step)
                 own_progress = 1.0 if ends_now else clock.progress(step)
-                progress, checkpoint_due = self.processes.maximum(
-                    own_progress, float(self._checkpoint_due(step, clock))
-                )
+                wants_checkpoint = float(self._checkpoint_due(step, clock))
+                progress, checkpoint_due = self.processes.maximum(own_progress, wants_checkpoint)
                 if checkpoint_due:
                     self._save(step, clock)
                 if progress >= 1:
                     break
+
+                # Make a step
                 with clock.waiting():
                     batches = [stream.batch(step, config.batch) for stream in self.streams]
                 rate = config.learning_rate * self.objective.learning_rate_factor(
@@ -295,8 +308,20 @@ class Run:
                     group["lr"] = rate
                 losses = self._step(step, batches)
                 step += 1
+
+                # Report it
                 pace = clock.pace(step, sum(map(len, batches)) * self.processes.count)
-                entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace, self.validated)
+                entry = Progress(
+                    step=step,
+                    progress=progress,
+                    learning_rate=rate,
+                    losses=losses,
+                    elapsed_s=clock.elapsed_s(),
+                    samples_per_s=pace.samples_per_s,
+                    waiting=pace.waiting,
+                    eta_s=pace.eta_s,
+                    validation=self.last_scores,
+                )
                 log.add(entry)
                 if self.validation is not None and step % config.validate_every == 0:
                     self._validate(log, step)
@@ -322,7 +347,7 @@ class Run:
         if "holes_seen" in scores:
             scores |= {"overfit": memorised_gain(scores, first)}
         log.add_validation(step, scores)
-        self.validated = scores
+        self.last_scores = scores
         score = scores.get("score")
         best = self.state.best_score
         if self.keeps_best and score is not None and is_better(score, best):
@@ -330,10 +355,10 @@ class Run:
             self._write_model(step)
 
     def _checkpoint_due(self, step: int, clock: RunClock) -> bool:
-        """Whether to write a checkpoint: some time after the last one, and at once after better weights were kept.
+        """Whether to write a checkpoint: `checkpoint_minutes` after the last one, or after better weights.
 
-        The checkpoint holds the score of the best weights. A run that resumed from an older one could
-        replace them by worse ones.
+        A checkpoint also holds the score of the best weights. With an older checkpoint, a resumed run
+        would not know that score, and could replace the best weights with worse ones.
         """
         has_new_steps = step > self.state.step
         has_better_weights = self.state.best_step > self.state.step
@@ -345,15 +370,14 @@ class Run:
         return self.processes.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
-        """One step of all weights, by the mean gradient of the streams."""
+        """Update all weights once, by the mean gradient over the samples of all streams."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = []
         done = 0
         count = sum(map(len, batches))
         for number, batch in enumerate(batches):
-            # Random numbers depend on the stream and the step, not on the process that computes them.
             stream = number * self.processes.count + self.processes.rank
-            torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
+            torch.manual_seed(step_seed(self.config.seed, step, stream))
             for piece in self._split(batch):
                 share = len(piece) / count
                 done += len(piece)
@@ -404,6 +428,7 @@ class Run:
         }
 
     def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
+        """Raise a FloatingPointError if the loss is not finite, after saving its batch."""
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -436,14 +461,15 @@ class Run:
         streams = []
         for number in range(processes.rank, count, processes.count):
             seed = f"{config.seed}/{number}"
-            at = self.state.positions[number] if self.state.positions else None
+            position = self.state.positions[number] if self.state.positions else None
             scenes = self.objective.training_scenes(seed)
             streams.append(
-                SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, at)
+                SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, position)
             )
         return streams
 
     def _save(self, step: int, clock: RunClock) -> None:
+        """Write a checkpoint, and the averaged weights unless the run keeps the best ones."""
         positions = self.processes.gather([stream.position for stream in self.streams])
         self.state = replace(self.state, step=step, elapsed_s=clock.elapsed_s(), positions=positions)
         if self.processes.first:
@@ -453,6 +479,7 @@ class Run:
         clock.note_checkpoint()
 
     def _write_model(self, step: int | None = None) -> None:
+        """Write the averaged weights, with a card that names their step: that of the state by default."""
         state = self.state if step is None else replace(self.state, step=step)
         self.objective.save(
             self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary)
@@ -464,18 +491,29 @@ def memorised_gain(scores: Mapping[str, float | None], first: Mapping[str, float
 
     Gains are relative to the scores of the first validation. None if a score is missing.
     """
-    gains = []
-    for name in ("holes_seen", "holes_alike"):
+
+    def gain(name: str) -> float | None:
         now = scores.get(name)
         before = first.get(name)
-        if now is None or before is None:
-            return None
-        gains.append(now - before)
-    return gains[0] - gains[1]
+        return None if now is None or before is None else now - before
+
+    on_training_views = gain("holes_seen")
+    on_new_views = gain("holes_alike")
+    if on_training_views is None or on_new_views is None:
+        return None
+    return on_training_views - on_new_views
+
+
+def step_seed(seed: int, step: int, stream: int) -> int:
+    """The seed of the random numbers of one stream in one step, whichever process computes it.
+
+    It is different for each step and stream of runs of up to 1,000,003 steps and 1,009 streams.
+    """
+    return (seed * 1_000_003 + step) * 1_009 + stream
 
 
 def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
-    """The config with a definite precision: the device's faster one replaces `auto`.
+    """The config with a definite precision: `auto` becomes the one that is faster on the device.
 
     The run's files keep `auto`, because the run may be resumed on another machine.
     """
@@ -485,7 +523,7 @@ def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """The update rule of the averaged weights: in each step they move towards the weights by 1 - decay.
+    """The update rule of the averaged weights: each step moves them by 1 - decay towards the weights.
 
     They move faster in the first steps, so that the initial weights do not stay in the average.
     """

@@ -75,9 +75,9 @@ class Objective(nn.Module, Generic[Model]):
     adversary: Adversary | None = None
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
-    compares_seen = False
-    """Whether the validation also scores views that the run trains on, and new views of the same
-    people, beginning with the weights it starts from."""
+    scores_training_views = False
+    """Whether the validation also scores views that the run trains on ("holes_seen"), and new views of
+    the same people ("holes_alike"). Then the starting weights are scored, too, to compare with."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()

@@ -41,7 +41,7 @@ SAMPLING = SamplingConfig(
 class PaperObjective(Objective[PatchTransformer]):
     """Section 8: L1 inside and outside the holes, on the network's own image Ftilde, and L_adv on Fhat."""
 
-    compares_seen = True
+    scores_training_views = True
 
     def __init__(self, config: TrainConfig, options: "PaperObjectiveConfig", start: nn.Module | None) -> None:
         super().__init__(config, PatchTransformer(options.model))
