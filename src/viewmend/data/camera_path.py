@@ -51,9 +51,9 @@ def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3
 
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
     with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
-    0.5), "width" and "height". `origin_m` is where the origin of `like` lies in the capture's own
-    world (`origin_of`); poses that are nearer to it than to 0 are in that world. ValueError if the
-    file has other content.
+    0.5), "width" and "height". `origin_m` is the origin of `like` in the coordinates of the capture's
+    files (`origin_of`). Poses that are nearer to it than to 0 are taken to be in those coordinates.
+    ValueError if the file has other content.
     """
     try:
         content = read_json(bounded_bytes(file))
@@ -91,7 +91,7 @@ class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fps: Annotated[float, Meta(ge=1, le=240)] | None = None
     """None: the capture's."""
     loop: Annotated[str, one_of("bounce", "repeat")] = "bounce"
-    """What a motion does that is shorter: it plays back and forth, or again."""
+    """How a motion that is shorter than the turntable goes on: back and forth, or from its start."""
     size: Annotated[str, Meta(pattern=r"^[1-9]\d{1,3}x[1-9]\d{1,3}\Z")] | None = None
     """WIDTHxHEIGHT in pixels; None: the first camera's."""
     background: Literal["black", "white"] | None = None

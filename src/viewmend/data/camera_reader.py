@@ -39,7 +39,7 @@ class CameraReader:
     def __init__(self, folder: Path, camera: NativeCamera, frames: Sequence[str], clock: VideoClock | None):
         self.camera = camera
         self.rotation: Orientation | None = None
-        """How the EXIF of the first image that was read says to turn the camera's images."""
+        """How to turn the camera's images, by the EXIF of the first image that was read."""
         self._rotation_is_known = False
         self.warned = False
         """Whether the user was warned of the rotation."""
@@ -64,7 +64,7 @@ class CameraReader:
     def _has_mask_per_image(self) -> bool:
         """Whether mask files are numbered like the video's frames, not like the capture's.
 
-        That is so if there are fewer mask files than frames of the capture, but as many as the video has frames.
+        They are if there are fewer mask files than frames of the capture, but one per frame of the video.
         """
         if self._video is None or self.camera.mask is None or self._mask_video is not None:
             return False
@@ -76,7 +76,7 @@ class CameraReader:
         return not any(self.lacks(kind, time, exists) for kind in self.camera.file_kinds)
 
     def lacks(self, kind: FileKind, time: int, exists: Callable[[str], bool]) -> bool:
-        """Whether the camera has no file of this kind in the frame, as `has`."""
+        """Whether the camera has no file of this kind in the frame at index `time`, as in `has`."""
         number = self._index["masks" if kind == "mask" else "images"][time]
         return bool(number == ABSENT) or not exists(self.camera.file(kind, self._file_id(kind, time)))
 

@@ -38,6 +38,7 @@ MIN_SHARED_POINTS = 80
 LONGEST_PX = 256
 """Images are reduced to this size, in which the error of the hull is only a few pixels."""
 HULL = HullConfig(resolution=64)
+"""The hull whose surface is compared."""
 MIN_CAMERAS = 4
 """Smallest rig that is matched: fewer cameras share too little surface to validate the maps."""
 INLIER = 0.03
@@ -47,16 +48,18 @@ CLIPPED = 0.98
 IDENTITY_WEIGHT = 1e-4
 """Weight of the regularisation towards the identity, relative to the number of points."""
 ITERATIONS = 8
+"""The maps are fitted this many times with new weights."""
 FOLDS = 4
 """Cross-validation folds. Points are in spatial order, so each fold is another part of the surface."""
 MAX_RATIO = 0.9
 """Maps are used if they reduce the disagreement on held-out points to less than this share."""
 MAX_ODD = 2.0
-"""An odd camera keeps its map if its colours then disagree with the others' at most this many times
-as much as theirs among themselves."""
+"""A camera with an odd image gets a map if, with it, it disagrees with the others at most this many times as
+much as they disagree among themselves."""
 MIN_DISAGREEMENT = 0.012
 """A smaller disagreement is not corrected, as the error of the hull alone causes that much."""
 TINY = 1e-9
+"""Sums of weights are at least this, so that none is divided by 0."""
 
 Maps = Float[Tensor, "view 3 4"]
 Colours = Float[Tensor, "view point 3"]
@@ -194,20 +197,24 @@ def match_colours(
     enough = seen.sum(1) >= MIN_SHARED_POINTS
     if int(enough.sum()) < MIN_CAMERAS:
         return None
-    unlike = torch.tensor([name in odd for name in small.cameras.names]).to(enough)
-    good = SurfaceColours(colours.rgb[enough & ~unlike].double(), seen[enough & ~unlike])
+    is_odd = torch.tensor([name in odd for name in small.cameras.names]).to(enough)
+    is_good = enough & ~is_odd
+    good = SurfaceColours(colours.rgb[is_good].double(), seen[is_good])
     if len(good.rgb) < MIN_CAMERAS:
         return None
     before, after = _cross_validate(good)
     maps = _fit(good.rgb, good.seen)
+
+    # The maps of good cameras, and of odd ones that a map makes agree with them
     matched = _map(good.rgb, maps)
-    own = {
-        view: _fit_to(matched, good.seen, colours.rgb[view].double(), seen[view], after)
-        for view in (enough & unlike).nonzero()[:, 0].tolist()
-    }
-    own |= dict(zip((enough & ~unlike).nonzero()[:, 0].tolist(), maps, strict=True))
-    found = {small.cameras.names[view]: own for view, own in sorted(own.items()) if own is not None}
-    return ColourMatch(tuple(found), torch.stack([*found.values()]).float(), before, after)
+    map_of_view = dict(zip(is_good.nonzero()[:, 0].tolist(), maps, strict=True))
+    for view in (enough & is_odd).nonzero()[:, 0].tolist():
+        odd_map = _fit_to(matched, good.seen, colours.rgb[view].double(), seen[view], after)
+        if odd_map is not None:
+            map_of_view[view] = odd_map
+    views = sorted(map_of_view)
+    names = tuple(small.cameras.names[view] for view in views)
+    return ColourMatch(names, torch.stack([map_of_view[view] for view in views]).float(), before, after)
 
 
 def _fit_to(

@@ -23,16 +23,19 @@ except ImportError:  # an extra: HEIC images are then refused by name
 DEPTH_UNITS_PER_M = 1000
 """Depth is stored as 16-bit whole millimetres."""
 MAX_DEPTH_M = 65.535
+"""The largest depth that can be stored, metres."""
 MAX_PIXELS = 2**27
-"""The largest image that is decoded. Its header is checked first."""
+"""Images with more pixels by their header are refused before they are decoded."""
 PNG_START = b"\x89PNG\r\n\x1a\n"
 """PNG files begin with this signature."""
+PNG_COLOUR_TYPE = 25
+"""Index of the byte of a PNG file that holds its colour type."""
 PNG_CHUNK_OVERHEAD = 12
 """Each chunk of a PNG has this many bytes apart from its data: length, type and checksum."""
 PNG_PALETTE = 3
-"""Byte 25 of a PNG has this value if colours are in a palette."""
+"""The colour type of a PNG whose colours are in a palette."""
 PNG_WITHOUT_ALPHA = (b"\0", b"\2")
-"""Byte 25 of a PNG has one of these values if it is grey or RGB, without alpha."""
+"""The colour types of a PNG that is grey or RGB, without alpha."""
 MAX_LABELS = 32
 """Masks with more values hold opacities, not labels."""
 OPAQUE_ALPHA = 128
@@ -70,8 +73,8 @@ the end of each run."""
 def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Read an image file as 8-bit RGB, exactly as stored: EXIF rotation is ignored, as calibrations ignore it.
 
-    All readers raise a CaptureError for a file that they cannot use, which `where` starts: file,
-    camera, frame.
+    All readers raise a CaptureError for a file that they cannot use. Its message begins with `where`,
+    which names the file, the camera and the frame.
     """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     bgr = _decode(_read_file(path, where), where, flags)
@@ -187,9 +190,10 @@ def is_opaque(alpha: UInt8[np.ndarray, "height width"]) -> bool:
 def uses_alpha(path: Path) -> bool:
     """Whether this is an image with alpha that cuts something out."""
     try:
-        head = read_bytes(path, 26)
-        if head.startswith(b"\xff\xd8") or (head.startswith(PNG_START) and head[25:] in PNG_WITHOUT_ALPHA):
-            return False  # JPEG, or PNG without alpha: not decoded
+        head = read_bytes(path, PNG_COLOUR_TYPE + 1)
+        is_jpeg = head.startswith(b"\xff\xd8")
+        if is_jpeg or (head.startswith(PNG_START) and head[PNG_COLOUR_TYPE:] in PNG_WITHOUT_ALPHA):
+            return False  # these need not be decoded
         read_alpha(path, str(path))
     except (ValueError, OSError):
         return False
@@ -229,8 +233,11 @@ def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: st
     blue, green, red = (bgr[..., channel] for channel in range(3))
     if (blue == green).all() and (green == red).all():
         return None
-    if data.startswith(PNG_START) and data[25] == PNG_PALETTE and (at := data.find(b"PLTE")) > 0:
-        return tuple(data[at + 6 : at + 3 : -1])
+    if data.startswith(PNG_START) and data[PNG_COLOUR_TYPE] == PNG_PALETTE and b"PLTE" in data:
+        palette = data[data.find(b"PLTE") + len(b"PLTE") :]
+        return tuple(reversed(palette[:3]))
+
+    # Each colour as one number, with blue in the upper 8 of 24 bits
     colours = np.unique(bgr.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32))
     if len(colours) > MAX_LABELS or np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) < 2:
         return None
@@ -329,7 +336,7 @@ def heif_size_px(data: bytes) -> tuple[int, int] | None:
         return None
     try:
         return pillow_heif.open_heif(data).size
-    except (ValueError, RuntimeError, OSError, EOFError, SyntaxError):  # one of them, by what is damaged
+    except (ValueError, RuntimeError, OSError, EOFError, SyntaxError):  # depending on the damage
         return None
 
 

@@ -4,8 +4,8 @@ A mask that is looser than the subject contains background. It shows as a bright
 seams inside the completed subject where a camera's rim is sampled. Along the outline, each pixel is
 compared with the mean colours of the subject and of the background nearby. The subject's share of
 the pixels rises from 0 to 1 with the distance from the edge of the mask; the subject ends where the
-share passes one half. One width per camera is enough: widths along an outline differ less than a
-pixel's own share is certain.
+share passes one half. One width per camera is enough: along an outline, widths differ by less than
+the share of a single pixel can tell.
 """
 
 from dataclasses import dataclass, replace
@@ -50,8 +50,8 @@ FULL_CONTRAST = 9.0
 MIN_EVIDENCE = 0.25
 """A camera is measured if its outline's pixels count at least this much on average."""
 TIGHT_PX = 1.15
-"""The distance at which the subject's share passes one half in an exact mask, pixels: those at its
-edge have the distance 1."""
+"""The distance at which the subject's share passes one half in an exact mask, pixels. Pixels at its edge have
+the distance 1."""
 MIN_LOOSE_PX = 1.25
 """Masks that are looser than this are tightened, pixels of the reduced image. Exact masks of studio
 scenes are measured to within 0.1, but a rim of a pixel costs less than a part that is cut off."""
@@ -165,7 +165,7 @@ def _judge_outline(
     subject = _colours_nearby(image, core.astype(np.float32), reach_px)
     background = _colours_nearby(image, (1 - near).astype(np.float32), reach_px)
 
-    # the position between both mean colours, and how many variances they are apart
+    # The position of each pixel between both mean colours, and how many variances these are apart
     change = subject.mean - background.mean
     precision = change / (subject.variance + background.variance + NOISE**2)
     contrast = (change * precision).sum(-1)

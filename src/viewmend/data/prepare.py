@@ -26,7 +26,7 @@ from viewmend.types import MultiViewFrame
 MAX_NAMED = 3
 """Warnings name the cameras that are not inputs if there are at most this many."""
 ENTERING_FRAMES = 30
-"""Frames from a subject's first sight on, in which half of the cameras are expected to see it."""
+"""Half of the cameras are expected to see a subject within this many frames after one sees it first."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def prepare(
 
 
 def adjustments(source: CaptureSource, frame: MultiViewFrame, issues: Sequence[Issue]) -> tuple[str, ...]:
-    """What `prepare` would change, by a frame of good cameras and its issues, in the same words."""
+    """`PreparedCapture.changes` of `prepare`, judging by a frame of good cameras and its issues."""
     if not frame.has_subject:
         return ()
     prepared = _adjusted(PreparedCapture(source), frame, issues, align=True, colours=True)
@@ -224,15 +224,15 @@ def first_with_subject(
 ) -> MultiViewFrame | None:
     """The input cameras in a frame in which `least` of them are present and see the subject; None without masks.
 
-    It is the first one from the index `first` on, or else the last one before. While a subject
-    enters, a later frame is taken, in which half of the cameras see it, or the most. CaptureError
-    if no frame has foreground.
+    It is the first such frame from the index `first` on, or else the last one before. If the subject
+    is still entering, it is a later frame: the first in which half of the cameras see the subject, or
+    the one in which the most do. CaptureError if no frame has foreground.
     """
     count = len(source.frame_ids)
     has_subject = False
     best = None
     most = 0
-    left = ENTERING_FRAMES
+    frames_left = ENTERING_FRAMES
     for time in (*range(first, count), *reversed(range(first))):
         frame = source.read(time)
         if frame.mask is None:
@@ -244,8 +244,10 @@ def first_with_subject(
         if len(frame.cameras) >= least and seeing > most:
             best = frame
             most = seeing
-        left -= best is not None
-        if best is not None and (2 * most >= len(best.cameras) or left == 0):
+        if best is None:
+            continue
+        frames_left -= 1
+        if 2 * most >= len(best.cameras) or frames_left == 0:
             break
     if has_subject:
         return best

@@ -33,10 +33,10 @@ class Undistortion:
                 K = camera.K.copy()
                 K[:2, 2] -= 0.5  # in OpenCV the centre of the first pixel is at 0
                 size = (camera.width, camera.height)
-                # Places in fixed point, to 1/32 pixel, are three times as fast as in floats
+                # Positions in fixed point, to 1/32 pixel, are three times as fast as in floats
                 maps = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, cv2.CV_16SC2)  # pyright: ignore
-                places, fractions = maps
-                self._maps = places, fractions
+                positions, fractions = maps
+                self._maps = positions, fractions
         smooth = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         rgb = smooth(images.rgb, *self._maps)
         mask = images.mask

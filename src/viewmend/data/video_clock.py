@@ -21,13 +21,15 @@ NEW_TIME = 0.75
 GAP = 1.5
 """Frames are missing where the interval is this many periods."""
 SAME_PHASE = 0.5
-"""Frames keep a constant distance to the times if the mean of their unit phasors is this long."""
+"""Frames keep a constant distance from the times if the mean of their unit phasors is at least this long."""
 RATE_TOLERANCE = 0.02
+"""Rates are equal if they differ by less than this share."""
 NOTEWORTHY = 0.05
 """Videos that differ in length by a smaller share are not mentioned."""
 MAX_NAMED = 3
+"""Issues name at most this many cameras."""
 DAY_S = 86400.0
-"""Timecodes start again at midnight, seconds."""
+"""Timecodes start again after a day, seconds."""
 
 TrackKind = Literal["images", "masks"]
 
@@ -159,29 +161,27 @@ class VideoClock:
         """The faults of a video, with {} for the camera."""
         images = [other for other in self.tracks if other.kind == "images"]
         rate = self.reference_fps or 1.0
-        what = f"the {track.kind} of {{}}"
-        than = "the others'"
+        subject = f"the {track.kind} of {{}}"
+        others = "the others'"
         faults = []
         if track.kind == "masks":
             images = [other for other in images if other.camera == track.camera]
-            than = "the images'"
+            others = "the images'"
             if track.camera in self.by_index:
                 return [
-                    f"{what} have other times than the images, but as many frames; they are matched one to one"
+                    f"{subject} have other times than the images, but as many frames; they are matched one to one"
                 ]
             if np.array_equal(track.times_s, images[0].times_s):
                 return []
         if track.kind == "images" and not track.is_timed:
             faults.append(
-                f"{what} have no times in their files; they are matched by index at {own_fps(track):.4g} fps"
+                f"{subject} have no times in their files; they are matched by index at {own_fps(track):.4g} fps"
             )
         if (track.camera, track.kind) in self.moved:
-            faults.append(f"{what} have no time in common with {than}; they are taken to start together")
+            faults.append(f"{subject} have no time in common with {others}; they are taken to start together")
         own_rate = track.fps or rate
         fastest = rate * (1 + RATE_TOLERANCE)
-        text = (
-            f"{what} have {own_rate:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
-        )
+        text = f"{subject} have {own_rate:.4g} frames per second, not {others} {rate:.4g}; they are matched by time"
         if own_rate < rate * (1 - RATE_TOLERANCE):
             faults.append(f"{text}, and the camera is absent in between")
         if (
@@ -195,18 +195,17 @@ class VideoClock:
         if track.gaps:
             lost = sum(count for _, count in track.gaps)
             from_s = track.gaps[0][0]
-            text = f"{what} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"
+            text = f"{subject} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"
             faults.append(f"{text}, by the video's own times; the camera is absent there")
         start_s, end_s = _extent(images)
         late_s = float(track.times_s[0]) - start_s
         early_s = end_s - _extent([track])[1]
         least_s = max(NOTEWORTHY * (end_s - start_s), NEW_TIME / rate)
         if late_s > least_s:
-            faults.append(f"{what} start {late_s:.2f} s after {than}; the camera is absent until then")
+            faults.append(f"{subject} start {late_s:.2f} s after {others}; the camera is absent until then")
         if early_s > least_s:
-            faults.append(
-                f"{what} end {early_s:.2f} s before {than}; from there on the camera is absent, or the capture ends"
-            )
+            consequence = "from there on the camera is absent, or the capture ends"
+            faults.append(f"{subject} end {early_s:.2f} s before {others}; {consequence}")
         return faults
 
 
@@ -228,11 +227,11 @@ def _named(cameras: list[str]) -> str:
 
 
 def match_tracks(tracks: Sequence[Track]) -> VideoClock:
-    """Match videos by time. A video of the rate that at least half of the cameras have sets the times.
+    """Match videos by time. One video sets the times, with a rate that at least half of the cameras reach.
 
-    Other videos fill its gaps. Videos of its rate that run with a constant distance of less than a
-    frame are matched one to one, and so are masks with as many frames as their images. ValueError
-    if no two cameras share a time.
+    Other videos fill its gaps. Videos of the same rate at a constant distance of less than a frame
+    are matched one to one, and so are masks with as many frames as their images. ValueError if no
+    two cameras share a time.
     """
     tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
     tracks, timecodes = _by_timecode(tracks)
@@ -240,10 +239,10 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     reference = _choose_reference(images.values())
     period_s = 1 / (reference.fps or 1.0)
     tracks, moved, by_index = _overlap(tracks, images, reference)
-    centred = [track.times_s - _phase_s(track.times_s, reference.times_s, period_s) for track in tracks]
-    times = _fill_gaps(reference.times_s, tracks, centred, period_s)
+    aligned = [track.times_s - _phase_s(track.times_s, reference.times_s, period_s) for track in tracks]
+    times = _fill_gaps(reference.times_s, tracks, aligned, period_s)
     found: dict[tuple[str, TrackKind], np.ndarray] = {}
-    for track, own in zip(tracks, centred, strict=True):
+    for track, own in zip(tracks, aligned, strict=True):
         index = _nearest(own, times)
         is_near = np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6
         found[track.camera, track.kind] = np.where(is_near, index, ABSENT)
@@ -260,7 +259,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     times = times[kept]
     frames = {key: index[kept] for key, index in found.items()}
     end_s = min(
-        own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)
+        own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, aligned, strict=True)
     )
     end = max(1, int((times < end_s - TOLERANCE * period_s).sum()))
     return VideoClock(tuple(tracks), reference.fps, times, end, frames, moved, by_index, timecodes)
@@ -306,11 +305,11 @@ def _overlap(
 def _fill_gaps(
     times_s: Float64[np.ndarray, "time"],
     tracks: Sequence[Track],
-    centred: Sequence[Float64[np.ndarray, "_frame"]],
+    aligned: Sequence[Float64[np.ndarray, "_frame"]],
     period_s: float,
 ) -> Float64[np.ndarray, "new_time"]:
-    """Add the times of images that are far from all times so far; `centred` are the videos' times."""
-    for track, own in zip(tracks, centred, strict=True):
+    """Add the times of images that are far from all times so far; `aligned` are the videos' times."""
+    for track, own in zip(tracks, aligned, strict=True):
         if track.kind == "images":
             far = np.abs(own - times_s[_nearest(times_s, own)]) > NEW_TIME * period_s
             times_s = np.sort(np.concatenate([times_s, own[far]]))
@@ -318,7 +317,7 @@ def _fill_gaps(
 
 
 def _with_known_rates(tracks: Sequence[Track]) -> list[Track]:
-    """The tracks, of which those without times have the usual rate of the images that have times, if there are any."""
+    """The tracks; those without times get the usual rate of the images that have times, if there are any."""
     rates = [track.fps for track in tracks if track.is_timed and track.kind == "images" and track.fps]
     if not rates:
         return list(tracks)

@@ -101,9 +101,10 @@ FIRST_FIELDS = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}
 """The field that is shown first, by FFmpeg's code of a stream's field order. Frames of some H.264 videos contradict it,
 because their decoder takes the bottom field as the first where the stream does not say."""
 RATE_TOLERANCE = 0.01
+"""The declared rate is used if the measured one differs from it by less than about this share."""
 NO_CHROMA_FILTER = "POINT"
-"""Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths
-follow this choice."""
+"""The interpolation of chroma in images at their own size. FFmpeg does it this way for 8 bits in any
+case; other bit depths follow this choice."""
 ALPHA_OPTIONS = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
 """Alpha is encoded as a second image. VP9's hidden reference frames would separate the two."""
 
@@ -152,7 +153,10 @@ class VideoProperties:
 
 
 def video_properties(path: Path) -> VideoProperties:
-    """Size, rate and frame times of a video, by its packets, start and end; CaptureError for a file without frames."""
+    """Size, rate and frame times of a video, from its packets and the frames at its start and end.
+
+    CaptureError for a file without frames.
+    """
     stat = path.stat() if path.is_file() else None
     return _measured(path, None if stat is None else (stat.st_mtime_ns, stat.st_size))
 
@@ -425,7 +429,10 @@ class VideoFile:
         parent's decoder, so it opens its own. It does not close the parent's, which would wait for threads."""
 
     def read(self, index: int, where: str) -> Image | None:
-        """The frame at `index` as RGB, read-only; None if damaged, a CaptureError that `where` starts if absent."""
+        """The frame at `index` as RGB, read-only; None if it is damaged.
+
+        CaptureError, whose message begins with `where`, if the video is too short.
+        """
         decoding = self._decoding.setdefault(os.getpid(), _Decoding())
         with decoding.lock:
             video = video_properties(self.path)
@@ -523,7 +530,9 @@ def tag_colours(context: "VideoCodecContext") -> None:
     """
     context.colorspace = SMPTE170M
     context.color_range = VIDEO_RANGE
-    context.color_primaries = context.color_trc = BT709  # those of sRGB; browsers need all of them
+    # The primaries and the transfer function of sRGB; browsers need both
+    context.color_primaries = BT709
+    context.color_trc = BT709
 
 
 def write_mp4(file: Path | BytesIO, frames: Iterable[Image], fps: float) -> None:

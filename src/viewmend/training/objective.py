@@ -28,11 +28,13 @@ from viewmend.utils.tensors import to_device
 Images = Sequence[Float[Tensor, "3 _h _w"]]
 Planes = Sequence[Float[Tensor, "_h _w"]]
 MIN_SQUARE = 1e-4
-"""Added to squared errors before the logarithm: no gain beyond 40 dB."""
+"""This is added to squared errors before the logarithm, so that nothing is gained beyond 40 dB."""
 WEIGHT_DECAY = 0.01
+"""The weight decay of AdamW."""
 WARMUP_PROGRESS = 0.1
 """The share of a run after which the learning rate is no longer warmed up."""
 TILE_PX = 256
+"""Each image in the image of a validation has this height, pixels."""
 SHOWN_VIEWS = 8
 """Views in the image of a validation."""
 Model = TypeVar("Model", bound=nn.Module)

@@ -277,7 +277,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
         load_start(self.model, start, kept="coarse.", optional="errors.")
         self.options = options
         self.weights = options.loss
-        # In a tuple: it is neither trained nor part of checkpoints.
+        # A tuple hides it from PyTorch: it is neither trained nor part of checkpoints
         self._perceptual = (load_lpips("alex"),) if options.loss.perceptual else ()
         self.validation = ViewsValidation(config, options)
         if options.train_params == "errors":
@@ -301,84 +301,85 @@ class ViewsObjective(Objective[ViewSynthNet]):
 
     def _loss(self, crop: TrainingView) -> StepOutput:
         """The loss of one crop. Its `image.outside` is the L1 of all pixels."""
-        made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.filled)
-        rows, columns = made.pixels.unbind(1)
+        prediction = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.filled)
+        rows, columns = prediction.pixels.unbind(1)
         weights = self.weights
         truth = crop.truth / 255
-        off = made.rgb - truth[:, rows, columns].T
+        difference = prediction.rgb - truth[:, rows, columns].T
 
         # Colours: L1, logarithmic error, damage to pixels that were right, differences of neighbours
         hole = crop.view.holes[rows, columns].float()
         weight = 1 + weights.holes * hole
-        colour = (weight * off.abs().mean(1)).sum() / weight.sum()
-        log_error = (off.square().mean() + MIN_SQUARE).log10()
+        colour = (weight * difference.abs().mean(1)).sum() / weight.sum()
+        log_error = (difference.square().mean() + MIN_SQUARE).log10()
         total = weights.colour * colour + weights.log_error * log_error
         was_right = (crop.view.rgb - truth)[:, rows, columns].abs().amax(0) < RIGHT_DIFFERENCE
-        total = total + weights.damage * (was_right * F.relu(off.abs().amax(1) - DAMAGE_DIFFERENCE)).mean()
-        total = total + weights.gradient * _gradient_loss(made, off, crop.view.mask.shape)
+        damage = (was_right * F.relu(difference.abs().amax(1) - DAMAGE_DIFFERENCE)).mean()
+        total = total + weights.damage * damage
+        total = total + weights.gradient * _gradient_loss(prediction, difference, crop.view.mask.shape)
 
         # Alpha and confidence
         alpha = crop.alpha[rows, columns] / 255
-        alpha_l1 = (made.alpha - alpha).abs().mean()
-        total = total + weights.alpha * (alpha_l1 + 0.3 * _cross_entropy(made.alpha, alpha))
-        is_correct = (off.detach().abs().amax(1) < CORRECT_DIFFERENCE).float()
-        total = total + weights.confidence * _cross_entropy(made.confidence, is_correct)
+        alpha_l1 = (prediction.alpha - alpha).abs().mean()
+        total = total + weights.alpha * (alpha_l1 + 0.3 * _cross_entropy(prediction.alpha, alpha))
+        is_correct = (difference.detach().abs().amax(1) < CORRECT_DIFFERENCE).float()
+        total = total + weights.confidence * _cross_entropy(prediction.confidence, is_correct)
 
         # Cells, the whole crop, and predicted errors
-        total = total + self._cell_terms(crop, made)
-        total = total + weights.perceptual * self._perceptual_term(crop, made)
-        total = total + weights.errors * self._error_terms(crop, made, off)
+        total = total + self._cell_terms(crop, prediction)
+        total = total + weights.perceptual * self._perceptual_term(crop, prediction)
+        total = total + weights.errors * self._error_terms(crop, prediction, difference)
 
-        inside = (hole * off.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
+        inside = (hole * difference.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
         return StepOutput(ImageLoss(inside, colour.detach(), log_error.detach()), total)
 
-    def _perceptual_term(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
+    def _perceptual_term(self, crop: TrainingView, prediction: ViewPrediction) -> Float[Tensor, ""]:
         """LPIPS of the crop with the predicted pixels against the truth, in float32; 0 for crops that are too small."""
         truth = crop.truth / 255
         if not self._perceptual or min(truth.shape[1:]) < MIN_PX["alex"]:
             return truth.new_zeros(())
-        at = tuple(made.pixels.T)
+        at = tuple(prediction.pixels.T)
         image = truth.clone()
-        image[:, at[0], at[1]] = made.rgb.T.float()
+        image[:, at[0], at[1]] = prediction.rgb.T.float()
         return self._perceptual[0].to(truth.device)(image[None], truth[None])[0]
 
     def _error_terms(
-        self, crop: TrainingView, made: ViewPrediction, off: Float[Tensor, "pixel 3"]
+        self, crop: TrainingView, prediction: ViewPrediction, difference: Float[Tensor, "pixel 3"]
     ) -> Float[Tensor, ""]:
         """Cross-entropies of the error predictor, at the pixels that were predicted."""
         if self.model.errors is None:
-            return off.new_zeros(())
-        at = tuple(made.pixels.T)
+            return difference.new_zeros(())
+        at = tuple(prediction.pixels.T)
         found = self.model.errors(crop.view, crop.sources, crop.scale)
         rendered = crop.view.rgb[:, *at].T
-        predicted = made.rgb.detach()
-        truth = predicted - off.detach()
+        predicted = prediction.rgb.detach()
+        truth = predicted - difference.detach()
         wrong = ((rendered - truth).abs().amax(1) > CORRECT_DIFFERENCE).float()
         alpha = found.alpha[at]
         faded = alpha.detach()[:, None] * rendered
         gain = (rendered - predicted).square().mean(1)
         rest = (faded - predicted).square().mean(1)
         gains = _cross_entropy(found.gain[at], gain) + _cross_entropy(found.rest[at], rest)
-        other = _cross_entropy(found.wrong[at], wrong) + _cross_entropy(alpha, made.alpha.detach())
+        other = _cross_entropy(found.wrong[at], wrong) + _cross_entropy(alpha, prediction.alpha.detach())
         return other + GAIN_WEIGHT * gains
 
-    def _cell_terms(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
+    def _cell_terms(self, crop: TrainingView, prediction: ViewPrediction) -> Float[Tensor, ""]:
         """The terms of cells: their mean colour and, where true depth is available, depth and visibility."""
-        distribution = made.distribution
+        distribution = prediction.distribution
         weights = self.weights
         cells = tuple(distribution.cells.T)
         shares = distribution.logits.softmax(1)[..., None]
         truth = F.avg_pool2d(crop.truth[None] / 255, CELL_PX, ceil_mode=True)[0, :, cells[0], cells[1]].T
         colour = ((shares * distribution.samples.colour).sum(1) - truth).abs().mean()
         total = weights.cell_colour * colour
-        return total if crop.depth is None else total + self._depth_terms(crop, made, crop.depth)
+        return total if crop.depth is None else total + self._depth_terms(crop, prediction, crop.depth)
 
     def _depth_terms(
-        self, crop: TrainingView, made: ViewPrediction, true_depth: Float[Tensor, "height width"]
+        self, crop: TrainingView, prediction: ViewPrediction, true_depth: Float[Tensor, "height width"]
     ) -> Float[Tensor, ""]:
         """The terms of cells where the true depth is known: the depth itself, and which cameras see the surface."""
         # The cells' true offsets behind the proxy, where these are in the range of the hypotheses
-        distribution = made.distribution
+        distribution = prediction.distribution
         weights = self.weights
         cells = tuple(distribution.cells.T)
         alpha = F.avg_pool2d(crop.alpha[None] / 255, CELL_PX, ceil_mode=True)[0][cells]
@@ -397,7 +398,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
         depth = -_masked_mean((1 - upper_share) * lower_log + upper_share * upper_log, known)
 
         # The cameras that see the surface should have all the weight
-        seen = visible_cameras(crop, made, z)
+        seen = visible_cameras(crop, prediction, z)
         nearest = torch.where(upper_share < 0.5, lower, upper)
         if distribution.cameras is not None:
             seen = seen.gather(1, distribution.cameras)
@@ -438,10 +439,10 @@ class ViewsObjectiveConfig(ObjectiveConfig):
 
 
 def _gradient_loss(
-    made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size
+    prediction: ViewPrediction, difference: Float[Tensor, "pixel 3"], shape: torch.Size
 ) -> Float[Tensor, ""]:
     """Mean difference between the errors of neighbouring predicted pixels."""
-    image = scatter_to_image(F.pad(off, (0, 1), value=1.0), made.pixels, shape)
+    image = scatter_to_image(F.pad(difference, (0, 1), value=1.0), prediction.pixels, shape)
     total = image.new_zeros(())
     number = image.new_zeros(())
     for axis in (1, 2):
@@ -454,10 +455,10 @@ def _gradient_loss(
 
 
 def visible_cameras(
-    crop: TrainingView, made: ViewPrediction, z: Float[Tensor, "cell"]
+    crop: TrainingView, prediction: ViewPrediction, z: Float[Tensor, "cell"]
 ) -> Bool[Tensor, "cell view"]:
     """Which cameras see the true surface of each cell, at z-depth `z` in metres."""
-    centers = CELL_PX * (made.distribution.cells.flip(1).float() + 0.5)
+    centers = CELL_PX * (prediction.distribution.cells.flip(1).float() + 0.5)
     points = unproject(centers[None], z[None], crop.view.camera)[0]
     frame = crop.sources.views.frame
     assert frame.depth is not None, "scenes with true depth have it for all cameras"
@@ -507,19 +508,20 @@ class ViewsValidation:
         device = next(model.parameters()).device
         scores = []
         rows = []
-        for own in self._views:
-            own = to_device(own, device)
-            view = own.view
-            truth = own.truth / 255
-            made = model(view, own.sources, own.scale, filled=own.filled)
-            rgb = scatter_to_image(made.rgb, made.pixels, view.mask.shape)
-            subject = own.alpha > 127
+        for stored in self._views:
+            example = to_device(stored, device)
+            view = example.view
+            truth = example.truth / 255
+            prediction = model(view, example.sources, example.scale, filled=example.filled)
+            rgb = scatter_to_image(prediction.rgb, prediction.pixels, view.mask.shape)
+            subject = example.alpha > 127
             holes = (view.mask > 0) & (view.weights.sum(0) == 0)
             row = {"rendered": _psnr(view.rgb, truth), "completed": _psnr(rgb, truth)}
             row |= {"subject": _psnr(rgb, truth, subject), "holes": _psnr(rgb, truth, holes)}
             if model.errors is not None:
                 rim = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
-                part = attenuate_background(rim, model.errors(view, own.sources, own.scale), REFINED_FRACTION)
+                errors = model.errors(view, example.sources, example.scale)
+                part = attenuate_background(rim, errors, REFINED_FRACTION)
                 row["refined"] = _psnr(torch.where(part.refine_mask, rgb, (1 - part.error) * view.rgb), truth)
             scores.append(row)
             rows.append(torch.cat([view.rgb, rgb, truth], 2).cpu())

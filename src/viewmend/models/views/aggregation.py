@@ -80,7 +80,7 @@ class SampleAggregator(nn.Module):
     def _aggregate_numba(
         self, samples: RaySamples, prior: Float[Tensor, "ray sample view"]
     ) -> AggregatedSamples:
-        """The same in float32 by a compiled loop: sums over a few cameras are slow in PyTorch."""
+        """`forward` in float32 by a compiled loop: sums over a few cameras are slow in PyTorch."""
         from viewmend.models.views._sampler_numba import aggregate
 
         count, per_ray, views = prior.shape

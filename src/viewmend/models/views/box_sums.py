@@ -1,4 +1,4 @@
-"""Sums over boxes of images, whose sides may be tensors."""
+"""Sums over boxes in images; the sides of the boxes may be tensors."""
 
 from typing import NamedTuple
 
@@ -21,9 +21,10 @@ class BoxSums(NamedTuple):
     def means(
         self, uv_px: Float[Tensor, "ray sample image 2"], side: Int[Tensor, ""]
     ) -> Float[Tensor, "ray sample image channel"]:
-        """Means over boxes of `side` pixels, bilinear between box centres, 255 as 1; zeros outside an image.
+        """Means over boxes of `side` pixels, divided by 255, and interpolated bilinearly between box centres.
 
-        The four boxes around a position have nine corners, with a weight each.
+        Images are 0 beyond their borders. The four boxes around a position have nine corners, with a
+        weight each.
         """
         position = uv_px * (1 / side.double()) - 0.5
         first = position.floor()

@@ -315,7 +315,7 @@ def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
         premultiply(rgb.numpy(), mask.numpy(), depth.numpy(), bordered.numpy())
         return bordered
 
-    return _pyramids(views.frame.cameras, base, 3)
+    return _pyramids(views.frame.cameras, base, mask_channel=3)
 
 
 def silhouette_pyramids(silhouettes: Silhouettes) -> tuple[Pyramid, ...]:
@@ -324,7 +324,7 @@ def silhouette_pyramids(silhouettes: Silhouettes) -> tuple[Pyramid, ...]:
     def base(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 1"]:
         return F.pad(silhouettes.mask[view, :height, :width, None], (0, 0, 1, 1, 1, 1))
 
-    return _pyramids(silhouettes.cameras, base, 0)
+    return _pyramids(silhouettes.cameras, base, mask_channel=0)
 
 
 def downsample2x(image: UInt8[Tensor, "rows columns channel"]) -> UInt8[Tensor, "_rows _columns channel"]:
@@ -348,8 +348,10 @@ def _masks(views: ContextViews) -> UInt8[Tensor, "view height width"]:
     return views.frame.mask
 
 
-def _pyramids(cameras: Cameras, base: Callable[[int, int, int], Tensor], mask: int) -> tuple[Pyramid, ...]:
-    """The pyramid of every camera, whose finest level is base(view, width, height); `mask` is the mask's channel."""
+def _pyramids(
+    cameras: Cameras, base: Callable[[int, int, int], Tensor], mask_channel: int
+) -> tuple[Pyramid, ...]:
+    """The pyramid of every camera. Its finest level is base(view, width, height)."""
     made: dict[int, Pyramid] = {}
     sizes = cameras.size_px.tolist()
 
@@ -358,7 +360,7 @@ def _pyramids(cameras: Cameras, base: Callable[[int, int, int], Tensor], mask: i
         while min(levels[-1].shape[:2]) - 2 > SMALLEST_PX:
             levels.append(downsample2x(levels[-1]))
         level = min(AREA_LEVEL, len(levels) - 1)
-        sums = torch.stack([levels[at][..., mask].sum(dtype=torch.long) for at in (0, level)])
+        sums = torch.stack([levels[at][..., mask_channel].sum(dtype=torch.long) for at in (0, level)])
         mask_sum, coarse_sum = sums.tolist()
         area_px = coarse_sum / 255 * 4**level
         made[view] = Pyramid(tuple(levels), max(1.0, math.sqrt(area_px)), mask_sum)

@@ -60,8 +60,8 @@ PIXELS_AT_ONCE = 512
 """A chunk without gradients has this many pixels: the system allocates larger buffers page by page
 each time, which takes longer than the computation."""
 PIXELS_STEP = 64
-"""Layers get a multiple of this many pixels: convolutions and GELUs are compiled and kept for each
-number, which would be slow, and fragment the memory of a server."""
+"""Layers run on multiples of this many pixels. PyTorch compiles and keeps convolutions and GELUs for each
+number of pixels; for all numbers, that would be slow, and fragment the memory of a server."""
 
 
 class RayInputs(NamedTuple):

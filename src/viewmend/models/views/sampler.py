@@ -358,8 +358,9 @@ def _look_up(
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
     """Indices of the `count` source cameras with the highest prior weights on each ray; None if that is all of them.
 
-    The weights are added up over the samples of the rays. Of cameras with equal weights, for example of those that
-    have none of these samples in view, the first are chosen: `topk` may take any, and each runtime takes others.
+    The weights are added up over the samples of the rays. Of cameras with equal weights, such as those
+    that have none of these samples in view, the first are chosen. `topk` alone would choose different ones
+    in different runtimes.
     """
     if torch.compiler.is_exporting():  # of any number of cameras
         scores = _without_ties(score_cameras_torch(rays, sources))
@@ -371,7 +372,7 @@ def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor
 
 
 def _without_ties(scores: Float[Tensor, "ray camera"]) -> Float[Tensor, "ray camera"]:
-    """The scores, of which equal ones are made to fall from camera to camera."""
+    """The scores, lowered a little from camera to camera, so that equal ones differ."""
     return scores - TIE * torch.arange(scores.shape[1], device=scores.device)
 
 
@@ -492,9 +493,10 @@ def _between_four(
     lower: Int[Tensor, "*sample"],
     share: Float[Tensor, "*sample 2"],
 ) -> Float[Tensor, "*sample channel"]:
-    """Bilinear interpolation between two pixels from `upper` on and two from `lower` on.
+    """Bilinear interpolation between the pixels at `upper` and `lower`, and their right neighbours.
 
-    ONNX Runtime takes a fifth of the time that it needs for sums over an axis of four; a GPU is asked for more kernels.
+    In ONNX Runtime, this takes a fifth of the time of sums over an axis of four. A GPU would need more
+    kernels for it.
     """
     right, down = share[..., None].unbind(-2)
     left_values = [_look_up(pixels, first).to(share) for first in (upper, lower)]
@@ -527,7 +529,7 @@ def sample_level_cubic(
 
 
 def _on_host(cameras: Cameras) -> Cameras:
-    """The cameras on the CPU, where numbers of single cameras are computed; themselves while `torch.export` traces."""
+    """The cameras on the CPU, where values per camera are computed; unchanged while `torch.export` traces."""
     return cameras if cameras.K.device.type == "cpu" else cameras.on_host
 
 
