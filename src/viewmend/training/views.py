@@ -497,37 +497,50 @@ class ViewsValidation:
         """Score a model."""
         assert isinstance(model, ViewSynthNet)
         if not self._views:
-            scenes = validation_scenes(self.config.scenes, self.options.sampling)
-            samples = StoredSamples(
-                StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation"
-            )
-            net = initial_model(self.options, self.config.precision)
-            source = TrainingViews(samples, "validation", net, smooth_fill=0.0)
-            views = (view for number in count() for view in source.scene(number))
-            self._views = list(islice(views, self.config.validation_views))
+            self._views = self._make_views()
         device = next(model.parameters()).device
         scores = []
         rows = []
-        for stored in self._views:
-            example = to_device(stored, device)
-            view = example.view
-            truth = example.truth / 255
-            prediction = model(view, example.sources, example.scale, filled=example.filled)
-            rgb = scatter_to_image(prediction.rgb, prediction.pixels, view.mask.shape)
-            subject = example.alpha > 127
-            holes = (view.mask > 0) & (view.weights.sum(0) == 0)
-            row = {"rendered": _psnr(view.rgb, truth), "completed": _psnr(rgb, truth)}
-            row |= {"subject": _psnr(rgb, truth, subject), "holes": _psnr(rgb, truth, holes)}
-            if model.errors is not None:
-                rim = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
-                errors = model.errors(view, example.sources, example.scale)
-                part = attenuate_background(rim, errors, REFINED_FRACTION)
-                row["refined"] = _psnr(torch.where(part.refine_mask, rgb, (1 - part.error) * view.rgb), truth)
-            scores.append(row)
-            rows.append(torch.cat([view.rgb, rgb, truth], 2).cpu())
+        for view in self._views:
+            view_scores, row = _score_view(model, to_device(view, device))
+            scores.append(view_scores)
+            rows.append(row)
         write_rows(rows, image)
-        means = {name: float(torch.tensor([row[name] for row in scores]).nanmean()) for name in scores[0]}
+        means = {name: float(torch.tensor([found[name] for found in scores]).nanmean()) for name in scores[0]}
         return {name: None if math.isnan(mean) else mean for name, mean in means.items()}
+
+    def _make_views(self) -> list[TrainingView]:
+        """The views, whose holes are filled by the ray fill."""
+        scenes = validation_scenes(self.config.scenes, self.options.sampling)
+        maker = StoredSceneMaker(scenes.rigs, scenes.config)
+        samples = StoredSamples(maker, self.options.sampling, "validation")
+        net = initial_model(self.options, self.config.precision)
+        source = TrainingViews(samples, "validation", net, smooth_fill=0.0)
+        views = (view for number in count() for view in source.scene(number))
+        return list(islice(views, self.config.validation_views))
+
+
+def _score_view(
+    model: ViewSynthNet, example: TrainingView
+) -> tuple[dict[str, float], Float[Tensor, "3 _h _w"]]:
+    """The scores of one view, and a row of images: as rendered, completed, and true."""
+    view = example.view
+    truth = example.truth / 255
+    prediction = model(view, example.sources, example.scale, filled=example.filled)
+    rgb = scatter_to_image(prediction.rgb, prediction.pixels, view.mask.shape)
+    scores = {
+        "rendered": _psnr(view.rgb, truth),
+        "completed": _psnr(rgb, truth),
+        "subject": _psnr(rgb, truth, example.alpha > 127),
+        "holes": _psnr(rgb, truth, (view.mask > 0) & (view.weights.sum(0) == 0)),
+    }
+    if model.errors is not None:
+        rim = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
+        errors = model.errors(view, example.sources, example.scale)
+        part = attenuate_background(rim, errors, REFINED_FRACTION)
+        refined = torch.where(part.refine_mask, rgb, (1 - part.error) * view.rgb)
+        scores["refined"] = _psnr(refined, truth)
+    return scores, torch.cat([view.rgb, rgb, truth], 2).cpu()
 
 
 def _psnr(image: Image, truth: Image, where: Mask | None = None) -> float:
