@@ -45,7 +45,9 @@ PATIENCE = 6
 FEW_VALIDATIONS = 2
 """A run with fewer validations than this, at the recipe's interval, is too short to judge."""
 PADDING_PX = 8
+"""The subject's box has a margin of this many pixels."""
 TILE_PX = (320, 480)
+"""Width and height of the images in contact sheets, pixels."""
 
 
 @dataclass(frozen=True)

@@ -134,8 +134,13 @@ def load_run(
         for name, optimizer in optimizers.items():
             _load_optimizer(optimizer, _with_prefix(name, tensors))
         positions = tuple(ReplayPosition(**position) for position in values["positions"])
-        best = values.get("best_score"), values.get("best_step", 0)
-        return RunState(values["step"], values["elapsed_s"], positions, *best)
+        return RunState(
+            step=values["step"],
+            elapsed_s=values["elapsed_s"],
+            positions=positions,
+            best_score=values.get("best_score"),
+            best_step=values.get("best_step", 0),
+        )
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise RunError(
@@ -153,6 +158,7 @@ def _advice(path: Path) -> str:
 
 
 def _with_prefix(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of the module or optimiser `name`, under their names in it."""
     prefix = f"{name}/"
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
@@ -191,10 +197,12 @@ class Log:
 
     def __init__(self, out: Path, step: int, writes: bool) -> None:
         """`writes` is False in all processes but the first, which write nothing."""
-        self._file = self._board = None
+        self._file = None
+        self._board = None
         if not writes:
             return
-        self._path = path = out / "log.jsonl"
+        path = out / "log.jsonl"
+        self._path = path
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
         write_text(path, "".join(line for line in lines if line.endswith("\n") and not _is_later(line, step)))
         self._file = path.open("a", encoding="utf-8")

@@ -143,15 +143,15 @@ class CaptureRigs:
     frames: Sequence[int]
     seed: str
     held_back: Sequence[HeldBack | None] = ()
-    """What is never used of each capture."""
+    """The camera and frames of each capture that are never used."""
     _prepared: dict[int, PreparedCapture] = field(default_factory=dict)
 
     def rig(self, number: int) -> Scene:
         """Some frames of a random capture."""
         random = Random(f"{self.seed}/{number}")
-        which = random.randrange(len(self.captures))
-        capture, held_out = self.captures[which]
-        held_back = self.held_back[which] if self.held_back else None
+        index = random.randrange(len(self.captures))
+        capture, held_out = self.captures[index]
+        held_back = self.held_back[index] if self.held_back else None
         last = (len(capture.frame_ids) if held_back is None else held_back.first_frame) - 1
         first = random.randint(0, max(0, last - max(self.frames)))
         size_px = random.choice(self.config.sizes_px)
@@ -165,11 +165,11 @@ class CaptureRigs:
         ]
         frames = {time: frame.select(complete) for time, frame in frames.items()}
 
-        if which not in self._prepared:
+        if index not in self._prepared:
             unused = (held_out, None if held_back is None else held_back.camera)
             inputs = [name for name in capture.cameras.names if name not in unused]
-            self._prepared[which] = prepare(capture, inputs, match_colours=False, tighten_masks=False)
-        aligned = replace(self._prepared[which], max_image_size=size_px).cameras
+            self._prepared[index] = prepare(capture, inputs, match_colours=False, tighten_masks=False)
+        aligned = replace(self._prepared[index], max_image_size=size_px).cameras
 
         def cameras(held: str) -> Cameras:
             return aligned
@@ -204,15 +204,14 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
     if not folders:
         return studio
     opened = [own for folder in folders for own in open_training_captures(folder, config.hold_out)]
-    # Only for its checks: captures are aligned without the cameras that are held back.
+    # `prepare` only checks the captures here. `CaptureRigs` aligns them, without held-back cameras
     captures = [
         (prepare(own.source, align=False, match_colours=False, tighten_masks=False), own.left_out)
         for own in opened
     ]
-    back = [own.held_back for own in opened]
-    return MixedRigs(
-        CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed
-    )
+    held_back = [own.held_back for own in opened]
+    rigs = CaptureRigs(captures, config, frames, seed, held_back)
+    return MixedRigs(rigs, studio, config.captures_fraction, seed)
 
 
 @dataclass(frozen=True)

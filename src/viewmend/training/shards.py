@@ -196,6 +196,7 @@ def _take_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
 
 
 def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """Inverse of `_take_apart`; TypeError if a field has another type than its annotation."""
     if isinstance(value, list):
         return tuple(_put_together(item, tensors) for item in value)
     if isinstance(value, dict) and "tensor" in value:
@@ -203,11 +204,12 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, dict):
         name = value["kind"]
         kind = KINDS[name]
-        made = kind(**{str(n): _put_together(part, tensors) for n, part in value["fields"].items()})
-        wrong = [field for field, hint in _hints(kind).items() if not _fits(getattr(made, field), hint)]
+        parts = {str(key): _put_together(part, tensors) for key, part in value["fields"].items()}
+        whole = kind(**parts)
+        wrong = [field for field, hint in _hints(kind).items() if not _fits(getattr(whole, field), hint)]
         if wrong:
             raise TypeError(f"{wrong[0]} of {name} has another type")
-        return made
+        return whole
     return value
 
 

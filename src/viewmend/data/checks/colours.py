@@ -24,10 +24,10 @@ longer side."""
 HULL = HullConfig(resolution=64)
 """Hulls have this resolution."""
 SUSPECT = 1.25
-"""Changed images are tried for a camera whose distance is more than this many times the median:
-mirrored, rotated, BGR, and those of other cameras."""
+"""A camera whose colours differ from the others' by more than this many times the median is compared with
+changed images: mirrored, rotated, BGR, and those of other cameras."""
 FITS = 0.65
-"""A changed image explains the fault if its distance is below this share of the original's."""
+"""A changed image explains the fault if its difference is below this share of the original's."""
 PALE = 0.4
 """An image is grey if its saturation is below this share of the median."""
 COLOURFUL = 0.05
