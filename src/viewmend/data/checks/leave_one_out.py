@@ -147,7 +147,7 @@ def missed_share(inside: Silhouettes, covered: Silhouettes) -> Float[Tensor, "vi
 def pad_like(
     covered: Bool[Tensor, "view _height _width"], mask: UInt8[Tensor, "_view height width"]
 ) -> Silhouettes:
-    """A silhouette padded right and below with False to the size of the masks."""
+    """A silhouette padded with False at the right and bottom, to the size of the masks."""
     return F.pad(covered, (0, mask.shape[2] - covered.shape[2], 0, mask.shape[1] - covered.shape[1]))
 
 

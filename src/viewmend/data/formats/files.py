@@ -36,24 +36,28 @@ LABELS = ("mask_cihp", "schp")
 NO_SUBJECT = re.compile("background|plate|empty|board|calib|intrinsic")
 """Videos with such names do not show the subject."""
 IMAGE_SUFFIXES = (
-    *(
-        ".png",
-        ".jpg",
-        ".jpeg",
-        ".jpe",
-        ".jp2",
-        ".bmp",
-        ".dib",
-        ".tif",
-        ".tiff",
-        ".webp",
-        ".avif",
-        ".heic",
-        ".heif",
-        ".gif",
-        ".exr",
-    ),
-    *(".hdr", ".pbm", ".pgm", ".ppm", ".pnm", ".ras", ".sr"),
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jp2",
+    ".bmp",
+    ".dib",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".avif",
+    ".heic",
+    ".heif",
+    ".gif",
+    ".exr",
+    ".hdr",
+    ".pbm",
+    ".pgm",
+    ".ppm",
+    ".pnm",
+    ".ras",
+    ".sr",
 )
 HIDDEN = ("__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN")
 """Folders of file managers; other files and folders of theirs start with a dot."""
@@ -127,7 +131,7 @@ def names_of_patterns(patterns: Sequence[str]) -> list[str]:
 
 
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
-    """The items whose image is in the folder, with a warning of the others; all of them if fewer than two exist."""
+    """The items whose image is in the folder, with a warning about the others; all if fewer than two exist."""
     paths = [(number, path(item)) for number, item in enumerate(items) if stays_inside(path(item))]
     missing = [number for number, image in paths if not (folder / stored_path(folder, image)).is_file()]
     if not missing or len(items) - len(missing) < 2:
@@ -171,7 +175,7 @@ def with_folders(folder: Path, place: str, names: Iterable[str]) -> list[str]:
 
 
 def first_of(calibrations: Iterable[Path]) -> Path | None:
-    """The first of these files, with a warning of the others; None if there is none."""
+    """The first of these files, with a warning about the others; None if there is none."""
     first, *others = [*calibrations, None]
     unused = [path.name for path in others if path is not None]
     if unused:
@@ -181,20 +185,26 @@ def first_of(calibrations: Iterable[Path]) -> Path | None:
 
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """A path with `{frame}`, and the number in which each path differs; ValueError if paths differ in several parts."""
+    first = paths[0]
     if len(set(paths)) == 1:
-        return paths[0], ("0",) * len(paths)
-    same = [
-        takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False))
-        for step in (1, -1)
-    ]
-    before = paths[0][: len(list(same[0]))].rstrip("0123456789")
-    after = len(list(same[1]))
-    after = paths[0][len(paths[0]) - min(after, min(map(len, paths)) - len(before)) :].lstrip("0123456789")
+        return first, ("0",) * len(paths)
+
+    # The parts before and after the number are those that all paths share, without digits next to the number
+    before = first[: _count_shared(paths)].rstrip("0123456789")
+    num_shared = _count_shared([path[::-1] for path in paths])
+    num_after = min(num_shared, min(map(len, paths)) - len(before))
+    after = first[len(first) - num_after :].lstrip("0123456789")
     ids = tuple(path[len(before) : len(path) - len(after)] for path in paths)
     if not all(ids) or any("/" in name for name in ids):
-        got = f"{paths[0][:80]!r} and {paths[-1][:80]!r}"
+        got = f"{first[:80]!r} and {paths[-1][:80]!r}"
         raise ValueError(f"expected paths that differ in a number, got {got}; rename")
     return f"{before}{{frame}}{after}", ids
+
+
+def _count_shared(texts: Sequence[str]) -> int:
+    """How many characters at the start are the same in all texts."""
+    columns = zip(*texts, strict=False)
+    return sum(1 for _ in takewhile(lambda characters: len(set(characters)) == 1, columns))
 
 
 def find_mask(folder: Path, image: str) -> str | None:
@@ -393,14 +403,16 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         video = videos.get(name)
         if video is not None:
             entries[name] = {"width": video.width, "height": video.height, "video": path}
-        elif (images := list_images(folder, path)) is None:
+            continue
+        images = list_images(folder, path)
+        if images is None:
             raise ValueError(_without_images(folder, name, path))
-        else:
-            first = images.pattern.replace("{frame}", min(images.frames, key=frame_order))
-            width, height = image_size_px(folder, first)
-            entries[name] = {"width": width, "height": height, "image": images.pattern}
-            ids[name] = images.frames
-            ignored += [f"{name}: {images.ignored}"] if images.ignored else []
+        first = images.pattern.replace("{frame}", min(images.frames, key=frame_order))
+        width, height = image_size_px(folder, first)
+        entries[name] = {"width": width, "height": height, "image": images.pattern}
+        ids[name] = images.frames
+        if images.ignored:
+            ignored.append(f"{name}: {images.ignored}")
     if ignored:
         warn(f"images of {ignored[0]}, are ignored, as their names follow another pattern than the others'")
     masks = _find_masks(folder, tuple(paths))
@@ -652,7 +664,7 @@ def read_xml(data: bytes) -> Element:
 
 
 def xml_number(what: str, text: str | None) -> float:
-    """Parse a finite number, or raise a ValueError that `what` starts."""
+    """Parse a finite number. ValueError for other text, with a message that begins with `what`."""
     try:
         value = float(text or "")
     except ValueError:

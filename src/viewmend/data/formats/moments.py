@@ -66,9 +66,9 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
 def _without_strangers(
     images: Sequence[PosedImage], groups: list[list[int]], ids: Sequence[str]
 ) -> list[list[int]]:
-    """The groups without single images whose names have none of the frame ids, which are named.
+    """The groups, except single images whose names contain none of the frame ids. A warning names these.
 
-    Such photos help a reconstruction only. All groups are kept if fewer than two would be.
+    Such photos only help a reconstruction. All groups are kept if fewer than two would be.
     """
     strangers = [
         group for group in groups if len(group) == 1 and _complete(images[group[0]].path, ids) is None
