@@ -86,7 +86,7 @@ class ViewInputs(NamedTuple):
     rig_camera_from_world: Float[Tensor, "camera 4 4"]
     """The cameras' poses."""
     image_sizes_px: Int[Tensor, "camera 2"]
-    """Width and height of each camera's image; smaller ones are padded right and below."""
+    """Width and height of each camera's image; smaller ones are padded at the right and bottom."""
 
     @classmethod
     def of(cls, view: IncompleteView, context: ContextProvider, num_views: int) -> "ViewInputs":

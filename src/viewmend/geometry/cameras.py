@@ -38,7 +38,7 @@ class Cameras(OnDevice):
     K: Float[Tensor, "view 3 3"]
     camera_from_world: Float[Tensor, "view 4 4"]
     size_px: Int[Tensor, "view 2"]
-    """Width and height of each view's image. Stacks of images are padded right and below to the largest."""
+    """Width and height of each view's image. Stacks of images are padded at the right and bottom."""
 
     def __len__(self) -> int:
         return len(self.names)

@@ -73,7 +73,7 @@ class FusionConfig:
 
 @dataclass(frozen=True)
 class DepthViews(OnDevice):
-    """The subject's depth in some views, as a model predicts it. Images are padded right and below to the largest."""
+    """The subject's depth in some views, as a model predicts it. Images are padded to the largest."""
 
     cameras: Cameras
     depth: Float[Tensor, "view height width"]

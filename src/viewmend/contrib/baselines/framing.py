@@ -51,7 +51,7 @@ def resized_canvas(
 def window_canvas(
     rgb: Image, missing: Bool[Tensor, "height width"], size: tuple[int, int], dilation_px: int
 ) -> Canvas:
-    """The view in its own resolution; one smaller than `size` gets black right and below."""
+    """The view in its own resolution; one smaller than `size` gets black pixels at the right and bottom."""
     below, right = (max(0, least - side) for least, side in zip(size, rgb.shape[1:], strict=True))
     return _canvas(pad(rgb, (0, right, 0, below)), pad(missing, (0, right, 0, below)), dilation_px)
 

@@ -89,7 +89,7 @@ def settle_masks(
     """Compare the masks of one frame, drop unsupported parts, and make the masks that are missing.
 
     Args:
-        mask: masks of all cameras, padded right and below.
+        mask: masks of all cameras, padded at the right and bottom.
         images: the cameras' images, without padding.
         cameras: the cameras.
         bounds: the volume that contains the subject; None if unknown.
