@@ -77,7 +77,7 @@ def silhouette_iou(
 ) -> Float[Tensor, "view"]:
     """Intersection over union of the hull's silhouettes and the masks; NaN where both are empty.
 
-    Masks may be padded at the right and bottom.
+    Masks may be larger than the silhouettes, padded at the right and bottom.
     """
     inside = mask[:, : silhouettes.shape[1], : silhouettes.shape[2]] > FOREGROUND
     return (silhouettes & inside).sum((1, 2)) / (silhouettes | inside).sum((1, 2))
