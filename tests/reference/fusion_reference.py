@@ -27,14 +27,12 @@ def fuse_reference(hull, views, config):
 def smoothed(sums, index, config):
     """The sums of weighted distances and of confidence at a voxel, mixed with the means around it."""
     distance, confidence, count = sums[index]
-    if not count:
-        return distance, confidence
     around = np.zeros(2)
     for step in itertools.product((-1, 0, 1), repeat=3):
         at = np.array(index) + step
         if (at >= 0).all() and (at < sums.shape[:3]).all():
             around += sums[tuple(at)][:2] / 27
-    mean_confidence = confidence / count
+    mean_confidence = confidence / max(count, 1)
     sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
     sharp = min(1.0, max(0.0, sharp))
     return sharp * np.array([distance, confidence]) + (1 - sharp) * around

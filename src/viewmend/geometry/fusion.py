@@ -119,12 +119,11 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     add_up = _sums_numba if hull.values.device.type == "cpu" else _sums_torch
     summed, total, count = add_up(hull, views, config)
 
-    # smooth what is uncertain
+    # smooth what is uncertain; a voxel that no view sees is, too, so that there is no step next to it
     mean_confidence = total / count.clamp_min(1)
     sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
-    sharp = sharp.clamp(0, 1).masked_fill(count == 0, 1.0)
     sums = torch.stack([summed, total])
-    summed, total = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(sums, sharp)
+    summed, total = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(sums, sharp.clamp(0, 1))
 
     # add the hull: its occupancy is that of its own distance in voxels
     summed += config.hull_weight * (1 - 2 * hull.values)
