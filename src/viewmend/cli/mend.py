@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 LARGE_PX = 1000
 """Images with more pixels than this on their longer side take long; `--scale` is then recommended."""
 KEPT_MB = 300.0
-"""Memory for earlier frames, in MB, if the model does not need them: an orbit may return to them."""
+"""Memory for earlier frames, in MB, if the model does not use them: they are kept because an orbit may show
+a frame again."""
 LARGE_BUFFER_BYTES = 32_000_000
-"""Larger buffers are mapped separately: 32 MB is the most that glibc itself chooses. With 8 MB, as the
-live server has it, a film of 1080 x 1920 pixels takes a quarter longer."""
+"""Larger buffers get their own memory mappings. 32 MB is the largest threshold that glibc chooses by itself;
+with the 8 MB of the live server, a video of 1080 x 1920 pixels takes a quarter longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +47,10 @@ class Options:
     for pixels that a camera colours ("valid"), for holes, and for holes inside the true mask
     ("fg"). For comparison, it is also given for the whole image as rendered, and for holes that
     OpenCV's Telea fills. SSIM is given for the whole image, LPIPS (AlexNet) for the whole image and
-    for the subject. IoU compares alpha with the true mask. All scores are means over frames; those
-    of holes leave out frames with fewer than 50 such pixels, unless all have fewer. hole_fraction
-    is the fraction of the hull's pixels that are holes, completed_fraction the fraction that is
-    completed.
+    for the subject. IoU compares alpha with the true mask. All scores are means over frames. A
+    score of holes skips frames in which it covers fewer than 50 pixels, unless all frames have
+    fewer. hole_fraction is the fraction of the hull's pixels that are holes, completed_fraction the
+    fraction that is completed.
 
     Images are composited on black for output and scores, or on white if the model was trained on
     white (paper-small).
@@ -87,8 +88,8 @@ class Options:
     frames: str | None = None
     """Frames to use, as FIRST:END by index; all by default."""
     scale: float = 1.0
-    """Factor by which width and height of the images are reduced, above 0 and up to 1. Views of a
-    camera and of an orbit are reduced, too. 0.5 takes about a quarter of the time, and less memory."""
+    """Factor by which width and height of the images are reduced, above 0 and up to 1. Output views
+    are reduced, too, unless --path states their size. 0.5 takes about a quarter of the time, and less memory."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     alpha: bool = False
     """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9
@@ -100,8 +101,8 @@ class Options:
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "hull"
     """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that
-    the model 'views' predicts all around the subject. The latter takes several times as long as a
-    view, once per frame."""
+    the model 'views' predicts all around the subject. Fusing adds the time of several views to each
+    frame."""
     precision: Precision = "auto"
     """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was
     trained in it and the device computes in it natively, otherwise float32."""
@@ -158,7 +159,8 @@ def _mend_views(
 
     held = () if options.leave_out is None else (options.leave_out,)
     plan_times = [time for time, _ in plan]
-    frames = prefetch(capture, [time for time, _ in groupby(plan_times)])  # views in a row share a frame
+    # Successive views of one frame share it, so it is read once.
+    frames = prefetch(capture, [time for time, _ in groupby(plan_times)])
     frame = None
     trimmer = HeapTrimmer()
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
@@ -201,11 +203,11 @@ def _check(options: Options) -> None:
     """Raise a ValueError for options that contradict each other or are out of range."""
     if (options.leave_out is None) == (options.path is None):
         raise ValueError(
-            "expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them"
+            "expected either --leave-out CAMERA or --path orbit|FILE, got both or neither; give one of them"
         )
     if options.leave_out is None and options.protocol not in (None, "strict", "predicted-mask"):
         raise ValueError(
-            f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out"
+            f"expected --leave-out with --protocol {options.protocol}, got --path; omit --protocol"
         )
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(
@@ -285,7 +287,7 @@ def _make_mender(
 
 
 def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
-    """The frames with images of two or more input cameras; reports the others, which are left out.
+    """The frames with images of two or more input cameras; reports the others, which are skipped.
 
     Raises:
         ValueError: there is no such frame.
@@ -301,7 +303,7 @@ def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> li
         )
     if left_out:
         count = f"{len(left_out)} of {len(times)} frames"
-        say(f"{count} have fewer than two input cameras and are left out; the first is '{left_out[0]}'")
+        say(f"{count} have fewer than two input cameras and are skipped; the first is '{left_out[0]}'")
     return usable
 
 
@@ -343,7 +345,7 @@ def _circle(
             f"{capture.name}: expected a subject to circle, got none in these frames; choose other --frames"
         )
 
-    # One turn around its middle
+    # Circle the middle of what the subject covers.
     center = (extent.amin(0) + extent.amax(0)) / 2
     orbit = orbit_around(
         center,

@@ -2,9 +2,9 @@
 
 A hull cannot be concave, and with few cameras it is too large. Depth maps are fused as in Curless
 and Levoy (SIGGRAPH 1996): every voxel takes the weighted mean of its signed distances to the
-surfaces that the views see. The hull counts as one view more. So what no view says anything about
-stays as the hull has it, and depth that is uncertain moves the surface less. Where all depth is
-uncertain, distances are averaged over neighbouring voxels as well, since the surface would be rough.
+surfaces that the views see. The hull counts as an additional view. So the surface stays on the hull
+where no view near it has depth, and moves less where depth is uncertain. Where all depth is uncertain,
+distances are also averaged over neighbouring voxels; otherwise the surface would be rough.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from viewmend.geometry.threads import one_thread, parallel_for
 from viewmend.utils.tensors import OnDevice
 
 LEAST_CONFIDENCE = 1e-3
-"""A depth with a lower confidence counts with this one, so that weights are never 0."""
+"""Lower confidences are raised to this one, so that weights are never 0."""
 
 VOXELS_AT_ONCE = 2**18
 """The number of voxels that are fused together on a device other than the CPU."""
@@ -45,16 +45,16 @@ class FusionConfig:
     resolution: int = 160
     """Voxels along the longest side of the subject's box."""
     max_views: int = 24
-    """Largest number of views whose depth is predicted: first cameras of the rig, then virtual ones
-    in its gaps."""
+    """Largest number of views whose depth is predicted. The rig's cameras come first, then virtual
+    cameras in the gaps between them."""
     min_angle_deg: float = 8.0
     """Smallest angle between two of these views, as seen from the subject, in degrees."""
     view_px: int = 240
     """Pixels that the longest side of the subject's box spans in the views whose depth is predicted."""
     truncation_voxels: float = 3.0
-    """Distance in front of a surface, in voxels, from which a voxel counts as empty,
-    whatever its distance. Voxels that are farther than this behind the surface that a view
-    sees are hidden from it."""
+    """Largest signed distance, in voxels: voxels that are farther in front of a surface count as this
+    far from it. Those that are farther behind it are hidden from the view that sees it, which
+    says nothing about them."""
     hull_weight: float = 1.0
     """The hull counts as a view with this confidence. Other views have up to 1."""
     smooth_below: float = 0.2
@@ -113,10 +113,11 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     """Occupancy after fusion: 1 inside, 0 outside, one half on the surface, and never above the hull's.
 
     Each view that sees a voxel adds its signed distance to the surface along the axis of
-    its camera, truncated in front and weighted by the confidence. Behind the truncation,
-    the view says nothing.
+    its camera, weighted by the confidence. `config.truncation_voxels` limits distances in
+    front of the surface; a view says nothing about voxels that are farther behind it.
     """
     add_up = _sums_numba if hull.values.device.type == "cpu" else _sums_torch
+    # distances times weights, weights, and numbers of views, each summed over the views
     summed, total, count = add_up(hull, views, config)
 
     # smooth what is uncertain; a voxel that no view sees is, too, so that there is no step next to it
@@ -125,7 +126,7 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     sums = torch.stack([summed, total])
     summed, total = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(sums, sharp.clamp(0, 1))
 
-    # add the hull: its occupancy is that of its own distance in voxels
+    # add the hull as a view: an occupancy o stands for a signed distance of 1 - 2 o voxels
     summed += config.hull_weight * (1 - 2 * hull.values)
     total += config.hull_weight
     occupancy = 0.5 - 0.5 * summed / total

@@ -32,9 +32,10 @@ HELLO_S = 10.0
 ACK_S = 30.0
 """A client has this many seconds to acknowledge a frame."""
 REJECTED_PER_S = 1.0
-"""A client may send this many messages a second, on average, that are rejected: malformed, or too many."""
+"""A client may send this many rejected messages a second, on average. Messages are rejected if they are
+malformed or exceed the rate limit."""
 REJECTED_AT_ONCE = 19.0
-"""A client may send this many such messages in a burst."""
+"""A client may send this many rejected messages in a burst."""
 STATE_S = 300.0
 """The message `state` is repeated after this many seconds without a change, because pages' clocks drift."""
 RECENT_S = 2.0
@@ -95,9 +96,9 @@ class SentMessages:
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     made_ahead: int = 0
-    """`SharedState.made_ahead` at the last message `completed`."""
+    """How many meshes and completed views had been made ahead by the last message `completed`."""
     listed: dict[FrameKey, int] = field(default_factory=dict)
-    """The number of meshes and completed views of each frame at that time."""
+    """The number of meshes and completed views of each frame by the last message `completed`."""
 
 
 class ViewerConnection:
@@ -223,7 +224,7 @@ class ViewerConnection:
                 self._reject(CloseCode.MALFORMED, str(error))
 
     def _reject(self, code: CloseCode, message: str) -> None:
-        """Answer a client's message with an error, or close the connection if there are too many."""
+        """Answer a client's message with an error, or close the connection if too many were rejected."""
         if not self._rejected.allow():
             raise ClosingError(code, message)
         self._send_soon(protocol.error_json(code, message, fatal=False))
@@ -292,8 +293,8 @@ class ViewerConnection:
         now = self._now()
         self._send_new_rig()
 
-        # The state. Two kinds of changes do not show in its inputs, so it is computed each time: the
-        # frame of a clock that plays behind the live edge, and the states of extensions.
+        # Send the state if its inputs have changed. The inputs do not include the states of extensions,
+        # nor the frame of a clock that plays behind the live edge: in these cases, always compute the state.
         plays_behind = self._service.source.span.live and session.clock.playing and not session.clock.live
         changes_by_itself = bool(self._registry.extensions) or plays_behind
         is_overdue = now - self._sent.state_s >= STATE_S
@@ -302,7 +303,7 @@ class ViewerConnection:
             self._sent.state_inputs = inputs
             self._send_state(inputs)
 
-        # A view that the serving program wants shown, statistics, and what was made ahead
+        # Send a view that the serving program wants shown, statistics, and news of what was made ahead.
         if self._sent.rig is not None and shared.show and shared.show is not self._sent.show:
             self._sent.show = shared.show
             self._send_soon(shared.show)

@@ -15,7 +15,8 @@ from viewmend.data.camera_images import CameraImages
 ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds."""
 PHASE_GAIN = 0.05
-"""The ticks follow the cameras: each group moves them by this fraction of its images' median offset."""
+"""The ticks follow the cameras: each group moves later ticks by this fraction of the median offset of its
+images from their tick."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
@@ -86,7 +87,7 @@ class Aligner:
         self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def wants(self, taken_s: float, period_s: float) -> bool:
-        """Whether an image may be used: of a fast camera, only the image nearest to each tick is.
+        """Whether an image may be used. From a fast camera, only the image nearest to each tick is used.
 
         `period_s` is the time between two images of the camera.
         """

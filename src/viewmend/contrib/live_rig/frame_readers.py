@@ -29,7 +29,7 @@ SILENT_S = 1.0
 LATE_S = 0.1
 """Images of a recording that are overdue by this many seconds are skipped."""
 MIN_WAIT_S = 0.002
-"""If the reader waited longer than this for a packet, in seconds, the packet has just arrived;
+"""If the reader waited for a packet for more than this many seconds, the packet has just arrived;
 otherwise it may have been in a queue."""
 DAMAGED_S = 2.0
 """Images that follow a damaged one are dropped until the next key frame, for at most this many seconds."""
@@ -68,11 +68,11 @@ class Playback:
         self.length_s = length_s
         """The length of a lap. When the first recording ends, all of them start again."""
         self.shifts_s: dict[str, float] = {}
-        """The position of each recording's time 0 on the timeline, in seconds; the earliest image of all
-        is at 0. A recording that is not listed begins with its first image at 0."""
+        """Seconds to add to each recording's own times to get times on the timeline, which begins with the
+        earliest image of all recordings. A recording that is not listed begins at the timeline's start."""
 
     def synchronise(self, tracks: Sequence[Track]) -> str | None:
-        """Put these recordings on the timeline by their timestamps, or their timecodes.
+        """Put these recordings on the timeline, by timecodes if they all have matching ones, otherwise by timestamps.
 
         Returns a note for the user if their timecodes start at different times; None otherwise.
 
@@ -172,7 +172,7 @@ def _play_recording(
                 return
             yield DecodedImage(frame, due_s - camera.offset_s)
 
-        # Go on with the next lap, or with the current one of the others if this camera has fallen behind.
+        # Begin the next lap. If this recording has fallen behind, join the lap that the others are in.
         lap_start_s = max(lap_start_s + playback.length_s, playback.lap_start_s(time.monotonic()))
         position_s = 0.0
         if wait(lap_start_s - time.monotonic()):
@@ -224,7 +224,7 @@ class DamageFilter:
         self._damaged_s = now_s
 
     def accepts(self, frame: "VideoFrame", is_damaged: bool, now_s: float) -> bool:
-        """Whether this image can be used; `is_damaged` is whether its packet is."""
+        """Whether this image can be used; `is_damaged` says whether its packet is damaged."""
         if frame.is_corrupt or is_damaged:
             self.note_damaged(now_s)
             return False
@@ -236,6 +236,6 @@ class DamageFilter:
         return True
 
     def _count_rejected(self) -> None:
-        """Count a rejected image; those at the start, where a stream was joined in its middle, do not count."""
+        """Count a rejected image, unless none was accepted yet: a stream that is joined midway starts with damage."""
         if self._has_begun:
             self._counts["torn"] += 1

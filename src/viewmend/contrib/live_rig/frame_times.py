@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 MAX_DRIVER_DELAY_S = 1.0
-"""A driver's timestamp is on a clock of this machine if that clock puts it at most this many seconds
-before the image's arrival."""
+"""A driver's timestamp is taken to be on one of this machine's clocks if, on that clock, it is less than this
+many seconds before the image's arrival."""
 LAG_PACKETS = {"rtsp": 1, "rtp": 1, "mpegts": 2}
-"""FFmpeg returns a packet of these formats this many packets late: its parsers find the end of an
-image only at the start of the next one."""
+"""How many packets FFmpeg's output lags behind its input, by format: its parsers find the end of an image only
+at the start of the next one."""
 UNTIMED_FORMATS = WITHOUT_TIMES | {"mpjpeg", "rawvideo", "image2pipe", "jpeg_pipe"}
 """These formats of FFmpeg have no meaningful timestamps."""
 
@@ -56,8 +56,8 @@ class SenderTimes(ArrivalTimes):
         self._clock = SenderClock()
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last packets; None for those that were not waited for. The data
-        of the last one had already arrived at the first of these times, because of FFmpeg's lag."""
+        """When the reader received the last packets, the oldest first; None for those that were not waited
+        for. FFmpeg lags, so the data of the newest packet arrived at the first of these times."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ArrivalTimes.add_packet`."""

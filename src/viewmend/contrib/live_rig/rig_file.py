@@ -83,7 +83,7 @@ class LiveCamera:
     """One camera: its address, its calibration, and how its masks are made."""
 
     calibration: NativeCamera
-    """The calibration for images at the size at which they are used, with the lens distortion."""
+    """The calibration, including lens distortion, for images at the size at which they are used."""
     sent_px: tuple[int, int]
     """Width and height of the images that the camera sends; they may be reduced before use."""
     url: str
@@ -172,12 +172,12 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     """The calibration in a folder of any format, or in a file of such a folder.
 
     Raises:
-        CaptureError: there is none, or the calibration that was recognised is not in this file.
+        CaptureError: there is none, or the calibration recognised in the folder is another file.
     """
     if not path.is_file():
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # Another file is taken for another calibration if it has the same suffix, otherwise for a part of this one.
+    # A recognised file with the same suffix is another calibration. Otherwise `path` is part of the recognised one.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

@@ -29,7 +29,8 @@ WATCH_S = 1.0
 REPORT_S = 30.0
 """Losses are reported at this interval, in seconds."""
 FIRST_FRAME_S = 3.0
-"""A rig's first frame waits this many seconds for all cameras: alignment and axes are found in it."""
+"""A rig's first frame waits this many seconds for all cameras, because alignment and the axes of the
+page's orbit are found in it."""
 REPORTED_EVENTS = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
 """Events that are reported as losses; docs/guide/live-rig.md describes them."""
 
@@ -89,7 +90,7 @@ class RigFileSource(LiveSource):
         self._new_workers: list[CameraWorker] = []
         """Workers that `_begin_rig` is going to start."""
         self._first_frame_deadline_s: float | None = None
-        """When the first frame is added even without all cameras; None until it has images of two."""
+        """When the first frame is added even if cameras are missing; None until two cameras have sent images."""
         self._stopped = False
         self._stamp = FileStamp.of(path)
         self._reported: dict[str, dict[str, int]] = {}

@@ -86,7 +86,8 @@ class CameraWorker:
             camera: the camera.
             connect: connects to the camera, and generates its images until it fails.
             deliver: called with the camera's name, the time at which an image was taken, and the image.
-            wants: returns whether an image is used, by its time and the camera's interval between images.
+            wants: returns whether an image is used; called with the time at which it was taken and the
+                camera's average time between two images.
 
         Raises:
             CaptureError: the camera's clean plate is missing, or of another size.
@@ -151,7 +152,7 @@ class CameraWorker:
                         if self._stopped.is_set():
                             return
                 if not self._stopped.is_set():
-                    self._note_failure("its images have ended")
+                    self._note_failure("there are no more images")
             except Exception as error:  # after any failure, the worker connects again
                 self._note_failure(str(error) or type(error).__name__)
             if self.wait(began_s + pause_s - time.monotonic()):
