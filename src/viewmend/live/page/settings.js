@@ -1,7 +1,13 @@
 // User settings, from the URL, the browser's storage and the defaults.
 
 /**
+ * @typedef {"rendered" | "holes" | "completed" | "split" | "depth" | "coverage" | "confidence" | "hull"
+ *   | "points"} Mode
+ */
+
+/**
  * @typedef {object} Choices
+ * @property {Mode} mode what is shown
  * @property {string} left mode on the left of the divider, or a value that matches `COMPARED`
  * @property {string} right mode on the right of the divider
  * @property {string} without names of cameras that are not used, separated by commas
@@ -50,7 +56,7 @@ const DEFAULTS = {
 /** The modes that show one view. */
 const VIEW_MODES = ["rendered", "holes", "completed", "depth", "coverage", "confidence", "hull", "points"];
 /**
- * What a split view can show besides these modes: the view completed by another model, the image of the
+ * What only a split view can show: the view completed by another model, the image of the
  * camera that the view is at, and the difference between the view and that image.
  */
 const COMPARED = /^(compared:[\w.-]+|original|error)$/;

@@ -10,6 +10,8 @@ const FLOATS = 5;
  * @typedef {object} Surface
  * @property {Float32Array} vertices u, v, z, s, t of each
  * @property {Uint32Array} solid triangles of the surfaces that were seen
+ * @property {Uint32Array} stretched triangles across jumps in depth, in the colours of the farther surface: a
+ *   guess at what was hidden
  */
 
 /** A typed array that grows as numbers are added. */

@@ -7,8 +7,8 @@ import { buildSurface } from "../draw/surface.js";
 
 /**
  * @typedef {{open: string} | {send: string} | {close: string} | {taken: true}} Command open a socket to a URL
- *   in place
- *   of the last one, send a text, close the socket with a reason, or note that the page has taken a frame
+ *   in place of the last one, send a text, close the socket with a reason, or note that the page has taken a
+ *   frame
  * @typedef {import("../draw/stage.js").Shown & {bytes: number}} Picture
  * @typedef {{opened: true} | {closed: {code: number, reason: string}} | {text: string} | {picture: Picture}
  *   | {undecodable: string}} Report

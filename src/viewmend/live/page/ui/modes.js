@@ -19,7 +19,7 @@ export const MODES = {
   points: "Points",
 };
 
-/** The names of the images that a split view can show besides. */
+/** The names of the images that only a split view can show. */
 const COMPARED_NAMES = { original: "Original", error: "Error map" };
 /** The sides of a split view. @type {("left" | "right")[]} */
 const SIDES = ["left", "right"];

@@ -24,9 +24,17 @@ const TURNTABLE_SECONDS = 6;
  */
 
 /**
+ * @typedef {object} TurntableFit
+ * @property {number[]} target metres
+ * @property {number} distance from the target, metres
+ * @property {number} f focal length, pixels
+ */
+
+/**
  * @typedef {object} Films what renders videos
  * @property {(onProgress: (progress: {part: number, text: string}) => void) => FilmInProgress} make
- *   finds the distance, and the focal length in pixels, at which every image shows the whole motion
+ * @property {(request: Record<string, number>) => Promise<TurntableFit>} turntable finds the fit at which
+ *   every image shows the whole motion
  */
 
 /**

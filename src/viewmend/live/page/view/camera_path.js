@@ -18,9 +18,9 @@ export const FPS = 30;
 export const MAX_POSES = 900;
 /** A recorded pose is stored if this share of a pose's time has passed since the last one. */
 const RECORDED_SHARE = 0.9;
-/** A full turn has this many views besides the first. */
+/** A full turn has this many steps between its views. */
 const TURN_STEPS = 8;
-/** A swing to both sides has this many views besides the first. */
+/** A swing to both sides has this many steps between its views. */
 const SWING_STEPS = 16;
 /** The indices of azimuth and roll in the numbers of a pose; see `numbersFromPose`. */
 const ANGLES = [3, 5];
