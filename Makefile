@@ -27,7 +27,7 @@ test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays
 tests: kernels
 	$(UNCHECKED) $(OPTIONS)
 
-slow: kernels ## tests over ten seconds, and those in a browser
+slow: kernels ## tests over five seconds, and those in a browser
 	$(UNCHECKED) -m slow $(OPTIONS)
 
 shapes: kernels

@@ -98,6 +98,7 @@ def test_simplified_meshes_keep_their_shape():
     assert len(simplify(mesh, 1e-6).vertices) > 1100, "only the poles, whose vertices coincide, are merged"
 
 
+@pytest.mark.slow
 def test_the_command_publishes_a_range_of_a_capture(tmp_path, capsys):
     write_capture(BallCapture(CAMERAS, 3), tmp_path / "ball", images="png")
     arguments = [

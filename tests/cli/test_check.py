@@ -18,6 +18,7 @@ def described(capsys, *arguments):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_real_capture_in_figures_and_in_words(shared, capsys, tmp_path):
     folder = shared / "captures" / "utrecht"
     capture = described(capsys, folder, "--frame", 3, "--out", tmp_path / "check.jpg")

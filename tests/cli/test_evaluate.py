@@ -93,7 +93,8 @@ def test_a_failed_cell_fails_the_command(tmp_path, capsys):
     assert failed == {"unfilled": 0, f"{tmp_path}/broken.py:Broken": 1}
 
 
-@pytest.mark.parametrize("model", ["nearest", pytest.param("views", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["nearest", "views"])
 def test_mend_and_evaluate_agree(folder, tmp_path, mend, capsys, model):
     _, mended, _ = mend(folder, tmp_path / "mend", "--leave-out", "c1", "--frames", "0:1", "--model", model)
     command = ["evaluate", str(folder), "--out", str(tmp_path / "evaluate"), "--scenes", "2", "--frames", "1"]

@@ -138,6 +138,7 @@ def test_usd_opens(scene):
     assert stage.GetEndTimeCode() == 1
 
 
+@pytest.mark.slow
 def test_views_of_a_rig_on_one_side_swing_only_there(tmp_path):
     side, out = str(tmp_path / "side"), str(tmp_path / "out")
     write_capture(BallCapture(ring(8, 48)[:3], 1), tmp_path / "side", images="png")
@@ -148,6 +149,7 @@ def test_views_of_a_rig_on_one_side_swing_only_there(tmp_path):
     assert float(torch.pdist(places[:, :3]).min()) > 0.3
 
 
+@pytest.mark.slow
 def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
     model = f"{tells_all.__file__}:TellsAll"
     counts = []
@@ -158,6 +160,7 @@ def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
     assert counts[0] > counts[1] + 1000
 
 
+@pytest.mark.slow
 def test_views_of_a_path_are_in_the_captures_world(folder, tmp_path, capsys):
     far = np.array([412345.6, 4512345.6, 210.0])
     moved = tmp_path / "far"

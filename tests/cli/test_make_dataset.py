@@ -14,10 +14,8 @@ def make(out, count, *more, recipe="views"):
     return main(["make-dataset", recipe, "--out", str(out), "--count", str(count), *BRIEF, *more])
 
 
-@pytest.mark.parametrize(
-    ("recipe", "kind", "views"),
-    [pytest.param("views", StoredScene, "1", marks=pytest.mark.slow), ("rays", RayBatch, "3")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("recipe", "kind", "views"), [("views", StoredScene, "1"), ("rays", RayBatch, "3")])
 def test_an_interrupted_data_set_is_completed_exactly(recipe, kind, views, tmp_path, monkeypatch, capsys):
     """Also from the middle of a scene."""
     for module in (

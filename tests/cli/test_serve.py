@@ -12,6 +12,7 @@ import pytest
 from viewmend.cli import serve
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_one_command_and_a_picture(sent):
     options = ["--port", "0", "--size", "96", "--cameras", "4", "--frames", "2", "--model", "nearest"]

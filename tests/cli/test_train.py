@@ -70,6 +70,7 @@ def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, t
     assert "differs in seed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_that_keeps_its_first_weights_says_so(capture, models, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": 20.0})
     assert finetune(capture, models / "views", tmp_path / "mine", "--validate-every", "1") == 0

@@ -71,6 +71,7 @@ def test_a_view_is_the_same_and_asks_little_of_the_device(name, monkeypatch):
     assert mended.shape == second.shape and bool(mended.isfinite().all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounds", [True, False])
 def test_the_hull_of_48_cameras_asks_little_of_the_device(bounds, monkeypatch):
     studio = Studio(StudioConfig(seed=10011, cameras=48, frames=1, size_px=SIZE_PX))

@@ -58,6 +58,7 @@ def test_every_scene_has_every_method(whole, small_scenes):
     assert (telea.hole_px, telea.hull_px) == (unfilled.hole_px, unfilled.hull_px)
 
 
+@pytest.mark.slow
 def test_processes_compute_the_same_numbers(whole, small_scenes, tmp_path):
     assert scores(run(small_scenes, tmp_path, jobs=2)) == scores(whole[1])
 
@@ -73,6 +74,7 @@ def script(small_scenes, tmp_path, ray=""):
     return [sys.executable, "-c", SCRIPT, str(tmp_path / "scenes"), str(tmp_path / "cells"), ray]
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes(whole, small_scenes, tmp_path):
     with subprocess.Popen(script(small_scenes, tmp_path), stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -228,6 +228,7 @@ def test_a_page_gets_a_mesh_fused_from_predicted_depth():
         assert get(f"{server.url}/assets/1/mesh?v={version}")[0] == 404, "this frame was not shown"
 
 
+@pytest.mark.slow
 def test_a_mesh_is_fused_on_another_device(monkeypatch):
     def fused(device):
         renderer = Renderer(Ball(), SmallerFill(), PIPELINE, completed_cameras=2)

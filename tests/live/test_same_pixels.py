@@ -94,6 +94,7 @@ def test_serve_and_mend_show_the_same_pixels_of_all_cameras(shared, tmp_path):
     compare_pixels(shared / "captures/wd2", "rays", tmp_path)
 
 
+@pytest.mark.slow
 def test_serve_and_mend_show_the_same_pixels(eight_cameras, tmp_path):
     page = compare_pixels(eight_cameras, "telea", tmp_path)
     unaligned, _ = served(eight_cameras, "telea", align=False)

@@ -110,6 +110,7 @@ def test_what_is_held_back_is_scored(place):
     assert {view.truth.time for view in table} == {3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("empty", [{19}, {18, 19}])
 def test_the_table_shows_the_subject_also_if_it_has_left(empty, tmp_path):
     write_capture(AwayBall(ring(5), 20, empty), tmp_path / "ball", images="png")
@@ -133,6 +134,7 @@ def test_of_a_splits_file_the_last_frames_are_held_back(balls, tmp_path):
     assert len(list(held_back_views(file, AUTO, table=True))) == 5
 
 
+@pytest.mark.slow
 def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):
     good, bad = ViewSynthNet(VIEWS_MODEL).eval(), ViewSynthNet(VIEWS_MODEL).eval()
     with torch.no_grad():

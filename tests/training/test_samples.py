@@ -119,6 +119,7 @@ def test_the_truth_is_on_black_and_the_context_is_in_the_past():
         assert not sample.truth[:, 0].any(), "the top row is background"
 
 
+@pytest.mark.slow
 def test_some_scenes_have_the_last_frame_only():
     sampling = replace(SAMPLING, frames=(0, 3), min_history=1, window_fraction=0.5)
     scenes, whole = (sample_scenes(SCENES, replace(sampling, window_fraction=f), "w") for f in (0.5, 1.0))
@@ -296,6 +297,7 @@ def splits(takes, tmp_path) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_of_a_splits_file_only_the_training_captures_are_used(splits):
     training = {
         scene.name: scene.left_out for scene in read_splits(splits).scenes if scene.split == "training"

@@ -89,6 +89,7 @@ def wait_for_state(viewer, **expected):
         viewer.wait_for("state")
 
 
+@pytest.mark.slow
 def test_the_viewer_on_air_controls_the_broadcast_view(on_air):
     with Client(on_air.ws) as first, Client(on_air.ws) as second:
         assert first.messages["welcome"]["broadcast"] is True
@@ -164,6 +165,7 @@ def encoders():
     return [thread for thread in threading.enumerate() if thread.name == "broadcast"]
 
 
+@pytest.mark.slow
 def test_nothing_is_rendered_or_encoded_while_nothing_is_watched():
     others = encoders()
     with broadcasting(size=(64, 48)) as server:

@@ -8,6 +8,8 @@ import pytest
 from viewmend.data.videos import write_mp4, write_webm
 from viewmend.live.video import ENCODERS, STRINGS, VideoStream, video_codecs
 
+pytestmark = pytest.mark.slow
+
 COLOURS = np.array(
     [(200, 40, 40), (40, 200, 40), (40, 40, 200), (220, 180, 150), (128, 128, 128), (250, 250, 250)]
 )

@@ -2,12 +2,15 @@
 
 import cv2
 import numpy as np
+import pytest
 from live.browser.conftest import SCREENSHOT_S, opened
 from live.live_servers import CAMERAS, PIPELINE, get
 from reference.ball import BallCapture
 
 from viewmend import serve
 from viewmend.models.smooth_fill import SmoothFill
+
+pytestmark = pytest.mark.slow
 
 NAME = CAMERAS.names[0]
 

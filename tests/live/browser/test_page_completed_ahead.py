@@ -13,6 +13,8 @@ from viewmend.models.smooth_fill import SmoothFill
 from viewmend.types import CompletedView
 from viewmend.utils.cancellation import stop_if_cancelled
 
+pytestmark = pytest.mark.slow
+
 COUNT = 12
 
 

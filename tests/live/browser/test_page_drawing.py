@@ -18,6 +18,8 @@ from viewmend.live.push import PushSource
 from viewmend.live.renderer import RenderRequest
 from viewmend.models.base import RenderQuality
 
+pytestmark = pytest.mark.slow
+
 MIN_DB, MIN_BALL_DB = 35.0, 32.0
 """Of a real scene; and of the ball, whose texture is as fine as its images of 48 pixels, which JPEG costs more."""
 COUNT_PAINTS = """() => {
@@ -223,7 +225,6 @@ def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, ball):
     assert max(tries.values()) >= 3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["wd2", "utrecht", "studio"])
 def test_drawn_pictures_of_real_scenes_are_the_servers(browser, request, scene, record_property):
     if scene == "studio":

@@ -5,8 +5,11 @@ import socket
 import threading
 from collections.abc import Iterator
 
+import pytest
 from live.browser.conftest import SCREENSHOT_S, View
 from live.live_servers import running
+
+pytestmark = pytest.mark.slow
 
 PREFIX, TOKEN = "/some/rig", "a-token-of-a-test-long-enough"
 

@@ -9,6 +9,8 @@ import pytest
 from live.browser.conftest import SCREENSHOT_S, SIZES, View
 from published_ball import FRAMES, published  # noqa: F401
 
+pytestmark = pytest.mark.slow
+
 FRAME = """<link rel="icon" href="data:,"><body style="margin:0">
 <iframe src="some/ball/index.html#time=0" style="width:900px;height:600px;border:0"></iframe>"""
 DRAWN = """Array.from([window, window[0] ?? window]).some(

@@ -5,6 +5,8 @@ import pytest
 from live.browser.conftest import SCREENSHOT_S, SIZES, opened
 from live.live_servers import running
 
+pytestmark = pytest.mark.slow
+
 
 def moments(page) -> list[float]:
     return [float(field.input_value()) for field in page.locator("#path-views input").all()]
