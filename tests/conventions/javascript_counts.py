@@ -1,4 +1,7 @@
-"""Counts of patterns that make JavaScript hard to read, by folder of the page: `python javascript_counts.py [PAGE]`."""
+"""Counts of patterns that make JavaScript hard to read, by folder of the page.
+
+Prints them when run in the folder `tests`: `python -m conventions.javascript_counts [PAGE]`.
+"""
 
 import re
 import sys
@@ -6,9 +9,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from conventions.line_counts import MAX_COLUMNS, count_folders, format_table
+
 PAGE = Path(__file__).resolve().parents[2] / "src" / "viewmend" / "live" / "page"
-MAX_COLUMNS = 110
-"""Lines should have at most this many columns."""
 TOKEN = re.compile(
     r"""
     (?P<comment>//[^\n]*|/\*.*?\*/)
@@ -155,25 +158,6 @@ def has_late_constants(code: str) -> int:
     return int(definition is not None and CONSTANT.search(code, definition.end()) is not None)
 
 
-def count_folders(page: Path) -> dict[str, Counter[str]]:
-    """The counts of each folder of the page; files next to the folders count as 'top level'."""
-    counts: dict[str, Counter[str]] = {}
-    for path in sorted(page.rglob("*.js")):
-        relative = path.relative_to(page)
-        folder = relative.parts[0] if len(relative.parts) > 1 else "top level"
-        counts.setdefault(folder, Counter()).update(count_file(path.read_text()))
-    return counts
-
-
-def format_table(counts: dict[str, Counter[str]]) -> str:
-    """A table of the counts, a line for each folder and one for their sum."""
-    total = sum(counts.values(), Counter[str]())
-    rows = [("folder", *COLUMNS)]
-    rows += [
-        (name, *(str(found[key]) for key in COLUMNS)) for name, found in {**counts, "total": total}.items()
-    ]
-    return "\n".join("".join(f"{cell:>16}" for cell in row) for row in rows)
-
-
 if __name__ == "__main__":
-    print(format_table(count_folders(Path(sys.argv[1]) if len(sys.argv) > 1 else PAGE)))
+    page = Path(sys.argv[1]) if len(sys.argv) > 1 else PAGE
+    print(format_table(count_folders(page, ".js", count_file), COLUMNS))

@@ -3,7 +3,7 @@
 import ast
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "viewmend"
@@ -157,22 +157,24 @@ def local_names(function: Function) -> set[str]:
     return found
 
 
-def count_packages(src: Path) -> dict[str, Counter[str]]:
-    """The counts of each package in `src`; files next to the packages count as 'top level'."""
+def count_folders(
+    root: Path, suffix: str, count_file: Callable[[str], Counter[str]]
+) -> dict[str, Counter[str]]:
+    """The counts of each folder in `root`; files next to the folders count as 'top level'."""
     counts: dict[str, Counter[str]] = {}
-    for path in sorted(src.rglob("*.py")):
-        relative = path.relative_to(src)
-        package = relative.parts[0] if len(relative.parts) > 1 else "top level"
-        counts.setdefault(package, Counter()).update(count_file(path.read_text()))
+    for path in sorted(root.rglob(f"*{suffix}")):
+        relative = path.relative_to(root)
+        folder = relative.parts[0] if len(relative.parts) > 1 else "top level"
+        counts.setdefault(folder, Counter()).update(count_file(path.read_text()))
     return counts
 
 
-def format_table(counts: dict[str, Counter[str]]) -> str:
-    """A table of the counts, a line for each package and one for their sum."""
+def format_table(counts: dict[str, Counter[str]], columns: Iterable[str]) -> str:
+    """A table of the counts, a line for each folder and one for their sum."""
     total = sum(counts.values(), Counter[str]())
-    rows = [("package", *COLUMNS)]
+    rows = [("folder", *columns)]
     rows += [
-        (name, *(str(found[key]) for key in COLUMNS)) for name, found in {**counts, "total": total}.items()
+        (name, *(str(found[key]) for key in columns)) for name, found in {**counts, "total": total}.items()
     ]
     share = 100 * total["long_lines"] / max(total["lines"], 1)
     table = "\n".join("".join(f"{cell:>16}" for cell in row) for row in rows)
@@ -180,4 +182,5 @@ def format_table(counts: dict[str, Counter[str]]) -> str:
 
 
 if __name__ == "__main__":
-    print(format_table(count_packages(Path(sys.argv[1]) if len(sys.argv) > 1 else SRC)))
+    source = Path(sys.argv[1]) if len(sys.argv) > 1 else SRC
+    print(format_table(count_folders(source, ".py", count_file), COLUMNS))

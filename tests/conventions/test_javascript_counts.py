@@ -1,18 +1,18 @@
 """The page's JavaScript stays easy to read: `javascript_counts.py` finds none of the patterns that it counts."""
 
 from collections import Counter
-from pathlib import Path
 
 import pytest
-from conventions.javascript_counts import COLUMNS, PAGE, count_file, count_folders, format_table, strip_text
+from conventions.javascript_counts import COLUMNS, PAGE, count_file, strip_text
+from conventions.line_counts import count_folders, format_table
 
 
 def test_scripts_stay_easy_to_read():
-    counts = count_folders(PAGE)
+    counts = count_folders(PAGE, ".js", count_file)
     total = sum(counts.values(), Counter[str]())
     assert total["lines"] > 3_000
     found = {name: total[name] for name in COLUMNS if name != "lines" and total[name] > 0}
-    assert found == {}, f"\n{format_table(counts)}"
+    assert found == {}, f"\n{format_table(counts, COLUMNS)}"
 
 
 @pytest.mark.parametrize(
@@ -49,14 +49,3 @@ def test_text_and_comments_are_not_counted(text: str):
     code = strip_text(text)
     assert ";" not in code
     assert code.count("\n") == text.count("\n")
-
-
-def test_files_are_counted_by_folder(tmp_path: Path):
-    (tmp_path / "draw").mkdir()
-    (tmp_path / "draw" / "x.js").write_text("const [a, b] = [1, 2];\n")
-    (tmp_path / "y.js").write_text("const a = 1;\n\n")
-    counts = count_folders(tmp_path)
-    assert {name: (found["lines"], found["parallel"]) for name, found in counts.items()} == {
-        "draw": (1, 1),
-        "top level": (1, 0),
-    }
