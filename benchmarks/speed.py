@@ -5,6 +5,9 @@ crop and model, with what belongs to a frame computed before. Each model and siz
 inherits the settings of a fresh start. Times are medians in milliseconds. With --starts N, N fresh processes complete
 the same view, every second one of them next to busy processes, and the number of different pictures is printed: 1 is
 right.
+
+--models also takes `hull` and `fused`, the geometry of a frame of eight cameras, and `training`, a step of the recipe
+`views`, without the time for making samples, whatever the size.
 """
 
 import argparse
@@ -14,8 +17,16 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from measure import timed, write
+from measure import summarise, timed, write
+
+if TYPE_CHECKING:
+    from viewmend.training.run_files import Progress
 
 SEED = 10008
 """Seed of the performer, one of the test scenes."""
@@ -26,6 +37,8 @@ WINDOW = (0, 10, 20, 27, 28, 29, 30)
 """Frames that the stream holds for `paper-small`, whose whole window they are; the last is shown."""
 SIZES = ("320x320", "512x612", "1080x1920")
 MODELS = ("views", "rays", "paper-small")
+WARM_UP_STEPS = 4
+"""Training steps before those that are timed; the first three have fewer samples."""
 BUSY_LOOP = "while True: pass"
 """What a busy process does, in Python."""
 
@@ -43,7 +56,7 @@ def main() -> None:
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
-        print(json.dumps(measure(options.models[0], options.sizes[0], options.runs)))
+        print(json.dumps(measure_any(options.models[0], options.sizes[0], options.runs)))
         return
     if options.starts:
         print(f"{count_pictures(options)} picture(s) from {options.starts} starts")
@@ -67,7 +80,47 @@ def start_worker(model: str, size: str, runs: int) -> dict[str, object]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def measure(model: str, size: str, runs: int) -> dict[str, object]:
+def measure_any(model: str, size: str, runs: int) -> dict[str, object]:
+    """What a process measures for one of --models."""
+    if model == "training":
+        return measure_training(runs)
+    if model in ("hull", "fused"):
+        return measure_geometry(model == "fused", size, runs)
+    return measure_view(model, size, runs)
+
+
+def measure_training(runs: int) -> dict[str, object]:
+    """Times of a training step of the recipe `views`."""
+    from viewmend.training.loop import train
+    from viewmend.training.recipes import views
+
+    config = replace(views(), steps=runs + WARM_UP_STEPS, validate_every=0)
+    worked_s: list[float] = []
+
+    def note(progress: "Progress") -> None:
+        worked_s.append(progress.elapsed_s * (1 - progress.waiting))
+
+    with TemporaryDirectory() as folder:
+        train(config, Path(folder) / "run", report=note)
+    timed_s = worked_s[WARM_UP_STEPS - 1 :]
+    steps_ms = [1e3 * (after - before) for before, after in pairwise(timed_s)]
+    return {**summarise(steps_ms), "samples": config.batch}
+
+
+def measure_geometry(fused: bool, size: str, runs: int) -> dict[str, object]:
+    """Times of a frame's geometry, from its images and masks."""
+    from viewmend import Stream, StreamConfig, Studio, StudioConfig
+    from viewmend.models.registry import make_method
+
+    width, height = (int(side) for side in size.split("x"))
+    studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=SHOWN + 1, size_px=(width, height)))
+    frame = studio.read(SHOWN)
+    model = make_method("views")
+    config = StreamConfig(geometry="fused" if fused else "hull", memory_mb=None)
+    return dict(timed(lambda: Stream(model, config, studio.bounds).add_frame(frame), runs))
+
+
+def measure_view(model: str, size: str, runs: int) -> dict[str, object]:
     """Times of a view, its refined pixels, and a hash of its picture."""
     from viewmend import Stream, StreamConfig, Studio, StudioConfig, orbit
     from viewmend.models.registry import make_method
