@@ -5,14 +5,18 @@ BIN := .venv/bin
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
 # Static checks, documents and tests run next to each other.
 MAKEFLAGS += --jobs=4
+# Several processes read the same files, so the first one that compiles a file does so for all.
+unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/pytest -n auto --dist worksteal
 # Without the checks: JAXTYPING_DISABLE alone would still wrap every function.
 UNCHECKED := JAXTYPING_DISABLE=1 $(PYTEST) --jaxtyping-packages=
-# Array shapes are checked in every call: by `make test` in these tests, by `make test-all` in all of them.
+# Array shapes are checked in every call: by `make test` in these tests, which `shapes` runs and `tests` leaves out,
+# and by `make test-all` in all of them.
 CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/test_cameras.py \
 	tests/rendering/test_view.py tests/models/test_attention.py tests/data/test_prepare.py \
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
+KERNELS := $(shell find src -name '_*_numba.py')
 
 .PHONY: demo pictures performance site test test-all tests slow shapes kernels gate pyright docs format clean
 
@@ -25,7 +29,7 @@ test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays
 	$(PYTEST) -m ""
 
 tests: kernels
-	$(UNCHECKED) $(OPTIONS)
+	$(UNCHECKED) $(CHECKED:%=--ignore=%) $(OPTIONS)
 
 slow: kernels ## tests over five seconds, and those in a browser
 	$(UNCHECKED) -m slow $(OPTIONS)
@@ -33,8 +37,12 @@ slow: kernels ## tests over five seconds, and those in a browser
 shapes: kernels
 	$(BIN)/pytest $(CHECKED)
 
-kernels: .venv/installed ## compiled once, not by each worker
+kernels: out/kernels ## compiled once, not by each worker
+
+out/kernels: .venv/installed $(KERNELS)
 	$(BIN)/python tests/compile_kernels.py
+	mkdir -p out
+	touch $@
 
 docs: .venv/installed ## the documentation site, in out/site; strict, and nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

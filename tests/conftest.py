@@ -1,5 +1,6 @@
 """Fixtures and skips that all tests share."""
 
+import gc
 from collections import Counter
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from reference.shared_scenes import make_once, write_balls, write_takes
 
 # Tests are many small computations: a second thread costs more than it brings.
 torch.set_num_threads(1)
+# What is imported and collected stays until the end; searching it for garbage takes seconds.
+gc.disable()
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 SKIPPED: Counter[str] = Counter()
@@ -30,6 +33,11 @@ def pytest_unconfigure(config):
     if not config.option.collectonly:
         reasons = "; ".join(f"{count} ({reason})" for reason, count in SKIPPED.most_common())
         print(f"Skipped: {reasons or 'nothing'}.")
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items):
