@@ -1,5 +1,6 @@
 """Faults that users of other tools reported in public: calibrations and folders that do not match one to one."""
 
+import io
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -22,7 +23,12 @@ from viewmend.data.capture_folder import open_capture
 from viewmend.data.checks.leave_one_out import find_cut_off_subject, find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
-from viewmend.data.images import exif_orientation, orientation_of, tiff_orientation
+from viewmend.data.image_orientation import (
+    avif_orientation,
+    exif_orientation,
+    orientation_of,
+    tiff_orientation,
+)
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import reconstruct
@@ -418,6 +424,37 @@ def test_tiff_images_are_used_as_stored(lying, orientation):
     assert (found.rgb == expected.rgb).all() and (found.mask == expected.mask).all()
     orientations = {exif_orientation(path) for path in lying.glob("image/*/*.tif")}
     assert orientations == {orientation_of(orientation)}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_masks_that_follow_the_orientation_of_avif_are_turned_back(lying, orientation):
+    """Writers of AVIF store EXIF's orientation as properties of the image."""
+    avif = [path.with_suffix(".avif") for path in sorted(lying.glob("image/*/*.jpg"))]
+    for path in avif:
+        exif = Image.Exif()  # Pillow takes its orientation away
+        exif[0x0112] = orientation
+        Image.open(path.with_suffix(".jpg")).save(path, exif=exif)
+    text = (lying / "cameras.json").read_text()
+    (lying / "cameras.json").write_text(text.replace(".jpg", ".avif"))
+    expected = open_capture(lying).read(0)
+    assert {exif_orientation(path) for path in avif} == {orientation_of(orientation)}
+
+    turned = orientation_of(orientation)
+    for path in sorted(lying.glob("mask/*/*.png")) if turned is not None and turned.transposed else ():
+        Image.fromarray(turned.apply(np.asarray(Image.open(path)))).save(path)
+    found = open_capture(lying).read(0)
+    assert (found.rgb == expected.rgb).all() and (found.mask == expected.mask).all()
+
+
+@pytest.mark.parametrize("end", [11, 100, 180, 247, 252])
+def test_a_truncated_avif_has_no_orientation(end):
+    file = io.BytesIO()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 32)).save(file, "AVIF", exif=exif)
+    data = file.getvalue()
+    assert avif_orientation(data) == orientation_of(6)
+    assert avif_orientation(data[:end]) is None
 
 
 @pytest.mark.parametrize("end", [4, 9, 20])

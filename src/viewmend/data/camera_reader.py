@@ -9,10 +9,9 @@ from jaxtyping import Float64, UInt8
 
 from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
+from viewmend.data.image_orientation import Orientation, exif_orientation
 from viewmend.data.images import (
     RUN_LENGTH_SUFFIX,
-    Orientation,
-    exif_orientation,
     read_alpha,
     read_depth,
     read_mask,
@@ -169,7 +168,7 @@ class CameraReader:
             expected = f"a mask of {self.camera.width} x {self.camera.height} pixels as its image"
             got = f"{mask.shape[1]} x {mask.shape[0]}: the mask is turned by 90 degrees and the image is not"
             raise CaptureError(
-                f"{where}: expected {expected}, got {got} (neither has EXIF that says how); turn the mask"
+                f"{where}: expected {expected}, got {got} (neither file says how); turn the mask"
             )
         self._check_size(mask, where)
 

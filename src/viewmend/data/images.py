@@ -3,7 +3,6 @@
 import functools
 import io
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ from jaxtyping import Float32, UInt8, UInt16
 
 from viewmend.data.containers import read_bytes
 from viewmend.data.errors import CaptureError
+from viewmend.data.image_orientation import tiff_orientation
 from viewmend.utils.atomic_writes import write_atomically
 
 try:
@@ -49,22 +49,6 @@ HEIF_REFUSED = (
     "the images to JPEG or PNG"
 )
 """Messages about HEIC images say this if the extra is not installed."""
-EXIF_ORIENTATIONS = (
-    (False, False, True),
-    (False, True, True),
-    (False, True, False),
-    (True, False, False),
-    (True, False, True),
-    (True, True, True),
-    (True, True, False),
-)
-"""The fields of `Orientation` for the values 2 to 8 of EXIF's orientation tag; 1 is upright."""
-TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-"""The byte order of a TIFF file, as `struct` names it, by its first four bytes."""
-TIFF_ENTRY_BYTES = 12
-"""Length of an entry of a TIFF directory."""
-ORIENTATION_TAG = 274
-"""The tag of the orientation in EXIF and TIFF."""
 RUN_LENGTH_SUFFIX = ".bin"
 """Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then
 the end of each run."""
@@ -86,75 +70,6 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
             f"{where}: expected 8 bit, or 16 bit in full range, got {got}; write it as 8-bit PNG"
         )
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-
-
-@dataclass(frozen=True)
-class Orientation:
-    """How EXIF asks viewers to turn an image."""
-
-    transposed: bool
-    """Whether rows become columns, before the flips."""
-    flip_rows: bool
-    flip_columns: bool
-
-    def __str__(self) -> str:
-        if self.transposed:
-            return "turned by 90 degrees"
-        return "turned by 180 degrees" if self.flip_rows and self.flip_columns else "mirrored"
-
-    def apply(self, image: np.ndarray) -> np.ndarray:
-        """The image as viewers show it."""
-        turned = image.swapaxes(0, 1) if self.transposed else image
-        return np.ascontiguousarray(turned[:: -1 if self.flip_rows else 1, :: -1 if self.flip_columns else 1])
-
-    def undo(self, image: np.ndarray) -> np.ndarray:
-        """The image as it is stored, from the image that viewers show."""
-        stored = image[:: -1 if self.flip_rows else 1, :: -1 if self.flip_columns else 1]
-        return np.ascontiguousarray(stored.swapaxes(0, 1) if self.transposed else stored)
-
-
-def orientation_of(value: int) -> Orientation | None:
-    """The orientation that a value of EXIF's tag means; None for 1, which is upright, and for invalid values."""
-    if not 2 <= value < 2 + len(EXIF_ORIENTATIONS):
-        return None
-    transposed, flip_rows, flip_columns = EXIF_ORIENTATIONS[value - 2]
-    return Orientation(transposed, flip_rows, flip_columns)
-
-
-def tiff_orientation(data: bytes) -> Orientation | None:
-    """How a TIFF file's first directory asks viewers to turn the image; None if it does not, or for other data."""
-    order = TIFF_ORDERS.get(data[:4])
-    if order is None:
-        return None
-    try:
-        (at,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, at)
-        for entry in range(count):
-            tag, _, _, value = struct.unpack_from(f"{order}HHIH", data, at + 2 + TIFF_ENTRY_BYTES * entry)
-            if tag == ORIENTATION_TAG:
-                return orientation_of(value)
-    except struct.error:  # truncated
-        return None
-    return None
-
-
-def exif_orientation(path: Path) -> Orientation | None:
-    """How EXIF, or TIFF, asks viewers to turn the image; None if it does not, or if this is not an image."""
-    content = read_bytes(path)
-    if content[:4] in TIFF_ORDERS:
-        return tiff_orientation(content)
-    small = cv2.IMREAD_REDUCED_COLOR_4
-    data = np.frombuffer(content, np.uint8)
-    stored = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION)
-    turned = cv2.imdecode(data, small)
-    if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
-        return None
-    for transposed, flip_rows, flip_columns in EXIF_ORIENTATIONS:
-        orientation = Orientation(transposed, flip_rows, flip_columns)
-        shown = orientation.apply(stored)
-        if shown.shape == turned.shape and (shown == turned).all():
-            return orientation
-    return None
 
 
 def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
