@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from viewmend.cli import main
-from viewmend.data.colour_matching import MIN_CAMERAS, SurfaceColours, SurfacePoints, match_colours
+from viewmend.data.checks.colours import OtherSubjectRule
+from viewmend.data.colour_matching import (
+    MIN_CAMERAS,
+    SurfaceColours,
+    SurfacePoints,
+    best_agreement,
+    match_colours,
+)
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
 from viewmend.data.source import CaptureWrapper
@@ -155,3 +162,20 @@ def test_mend_says_that_colours_are_matched(studio, tmp_path, capsys):
     shutil.rmtree(tmp_path / "out")
     assert main([*arguments, "--no-match-colours"]) == 0
     assert "matched" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("step", "is_odd"), [(0.1, False), (0.3, True)])
+def test_a_camera_is_judged_by_what_its_peer_differs_from_a_third_one(step, is_odd, rng):
+    """Cameras 0 to 3 see one side alike; on the other, camera 4 sees what only 5 sees, which differs from 0 by 8 %."""
+    seen = torch.zeros(6, 600, dtype=torch.bool)
+    seen[:4, :200] = True
+    seen[[0, 5], 200:400] = True
+    seen[[4, 5], 400:] = True
+    rgb = 0.3 + 0.3 * torch.rand(1, 600, 3, generator=rng).repeat(6, 1, 1)
+    rgb[1:4] += 0.02
+    rgb[5] += 0.08
+    rgb[4] += 0.08 + step
+    found = best_agreement(SurfaceColours(rgb, seen))
+    assert torch.allclose(found.distance, torch.tensor([0.02, 0.0, 0.0, 0.0, step, 0.08]), atol=1e-4)
+    assert torch.allclose(found.peer_distance, torch.tensor([0.0, 0.0, 0.0, 0.0, 0.08, 0.02]), atol=1e-4)
+    assert OtherSubjectRule().applies(found).tolist() == [False] * 4 + [is_odd, False]

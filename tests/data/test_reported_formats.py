@@ -20,6 +20,7 @@ from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
 from viewmend.data.capture_folder import open_capture
+from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.leave_one_out import find_cut_off_subject, find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
@@ -32,6 +33,7 @@ from viewmend.data.image_orientation import (
 from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import reconstruct
+from viewmend.studio.stage import Studio, StudioConfig
 
 EASYMOCAP, QUALISYS, POSE2SIM, OPENCV = "easymocap", "qualisys", "pose2sim", "opencv"
 
@@ -494,6 +496,37 @@ def test_cameras_that_see_all_of_the_subject_are_not_blamed_for_borders(tmp_path
         found = find_cut_off_subject(cut)
         assert len(found) == (narrow == 7)
         assert all("cut off by the image border of all cameras but" in issue.text for issue in found)
+
+
+def cut_off(frame, names):
+    """The frame, with images of these cameras that begin and end inside the subject, on the left and below."""
+    rgb = torch.zeros_like(frame.rgb)
+    mask = torch.zeros_like(frame.mask)
+    cameras = []
+    for view, name in enumerate(frame.cameras.names):
+        inside = frame.mask[view] > 127
+        rows = inside.any(1).nonzero()[:, 0]
+        columns = inside.any(0).nonzero()[:, 0]
+        width, bottom = frame.cameras.size_px[view].tolist()
+        left = 0
+        if name in names:
+            bottom = int(0.35 * rows[0] + 0.65 * rows[-1])
+            left = int(0.75 * columns[0] + 0.25 * columns[-1])
+        cameras.append(frame.cameras[[view]].cropped(left, 0, width - left, bottom))
+        rgb[view, :, :bottom, : width - left] = frame.rgb[view, :, :bottom, left:]
+        mask[view, :bottom, : width - left] = frame.mask[view, :bottom, left:]
+    return replace(frame, cameras=concatenate_cameras(cameras), rgb=rgb, mask=mask)
+
+
+def test_colours_are_not_blamed_where_only_a_cut_off_camera_sees_the_same_surface():
+    studio = Studio(StudioConfig(seed=6, cameras=8, frames=1, size_px=128))
+    frame = cut_off(studio.read(0).without(["cam07"]), ["cam01", "cam02", "cam04", "cam05"])
+    assert find_odd_images(frame, studio.bounds) == ()
+    for name in ("cam01", "cam03", "cam06"):
+        rgb = frame.rgb.clone()
+        rgb[frame.cameras.names.index(name)] ^= 255
+        issues = find_odd_images(replace(frame, rgb=rgb), studio.bounds)
+        assert [issue.odd_image for issue in issues] == [name]
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (412345.6, 4512345.6, 210.0)])

@@ -107,37 +107,68 @@ class SurfacePoints:
         return SurfaceColours(sample_bilinear(rgb.float() / 255, self.uv_px, "border"), self.seen)
 
 
-def best_agreement(colours: SurfaceColours) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"]]:
+@dataclass(frozen=True)
+class BestAgreement:
     """How well each camera's colours agree with the other camera that they agree with best.
 
-    Returns the smallest RMS distance of RGB and the highest correlation, over the points that both
-    cameras see; NaN if no other camera shares enough points. A faulty camera disagrees with all
-    others; a correct one does not.
+    A faulty camera disagrees with all others; a correct one does not. Values are NaN where too few
+    points are shared.
     """
+
+    distance: Float[Tensor, "view"]
+    """The smallest RMS distance of RGB from another camera, over the points that both see."""
+    correlation: Float[Tensor, "view"]
+    """The highest correlation with another camera."""
+    peer_distance: Float[Tensor, "view"]
+    """The smallest distance of the camera of `distance` from a third one."""
+
+    @property
+    def typical(self) -> Float[Tensor, "view"]:
+        """The distance that a good camera may have.
+
+        It is the median, or the distance of the camera that it agrees with best from a third one: where
+        that is larger, the surface that these cameras share explains it, which the hull may misplace.
+        """
+        return self.peer_distance.nan_to_num(0.0).maximum(self.distance.nanmedian())
+
+
+def best_agreement(colours: SurfaceColours) -> BestAgreement:
+    """Compare each camera's colours with those of all others."""
     shared = zip(colours.rgb, colours.seen[:, None] & colours.seen, strict=True)
-    best = [agreement(own, both, colours, view) for view, (own, both) in enumerate(shared)]
-    distance, correlation = torch.tensor(best, device=colours.rgb.device).unbind(1)
-    return distance, correlation
+    pairs = [compare(own, both, colours, view) for view, (own, both) in enumerate(shared)]
+    distances, correlations = (torch.stack(values) for values in zip(*pairs, strict=True))
+    peer = distances.nan_to_num(torch.inf).argmin(1)
+    of_peer = distances[peer].fill_diagonal_(torch.nan)
+    return BestAgreement(_least(distances), -_least(-correlations), _least(of_peer))
 
 
-def agreement(
+def compare(
     own: Float[Tensor, "point 3"], shared: Bool[Tensor, "view point"], others: SurfaceColours, view: int
-) -> tuple[float, float]:
-    """`best_agreement` of the camera `view` with colours `own`, over the points shared with each other camera."""
+) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"]]:
+    """RMS distance of RGB and correlation of the colours `own` with each camera's, over the points that are shared.
+
+    NaN for the camera `view`, whose colours they are, and for cameras that share too few points.
+    """
     both = shared.float()
     both[view] = 0
     count = both.sum(1)
     enough = count >= MIN_SHARED_POINTS
-    if not bool(enough.any()):
-        return torch.nan, torch.nan
     both = both[enough, :, None]
     count = count[enough, None, None]
     rgb = others.rgb[enough]
     a, b = (x - (x * both).sum(1, keepdim=True) / count for x in (own.expand_as(rgb), rgb))
     products = [(x * y * both).sum((1, 2)) for x, y in ((a, b), (a, a), (b, b))]
-    correlation = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-6)
-    squares = ((own - rgb).square() * both).sum((1, 2)) / (3 * count[:, 0, 0])
-    return float(squares.amin().sqrt()), float(correlation.amax())
+    distance = own.new_full(enough.shape, torch.nan)
+    distance[enough] = (((own - rgb).square() * both).sum((1, 2)) / (3 * count[:, 0, 0])).sqrt()
+    correlation = own.new_full(enough.shape, torch.nan)
+    correlation[enough] = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-6)
+    return distance, correlation
+
+
+def _least(values: Float[Tensor, "view other"]) -> Float[Tensor, "view"]:
+    """The smallest value of each row; NaN where all are."""
+    least = values.nan_to_num(torch.inf).amin(1)
+    return torch.where(least.isfinite(), least, torch.nan)
 
 
 @dataclass(frozen=True)

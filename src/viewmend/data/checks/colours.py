@@ -7,7 +7,13 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from viewmend.data.colour_matching import SurfaceColours, SurfacePoints, agreement, best_agreement
+from viewmend.data.colour_matching import (
+    BestAgreement,
+    SurfaceColours,
+    SurfacePoints,
+    best_agreement,
+    compare,
+)
 from viewmend.data.errors import Issue
 from viewmend.data.source import limit_size
 from viewmend.geometry.bounds import Bounds
@@ -53,23 +59,21 @@ class OtherSubjectRule:
     min_distance: float = 0.09
     """The distance is larger than this."""
     ratio: float = 2.5
-    """It is also larger than this many times the median; or the following three conditions hold."""
+    """It is also larger than this many times the typical one; or the following three conditions hold."""
     lower_ratio: float = 1.55
-    """The distance is larger than this many times the median."""
+    """The distance is larger than this many times the typical one."""
     max_correlation: float = 0.72
     """The best correlation with the others is below this share of the median."""
     min_cameras: int = 5
     """The rig has at least this many cameras: medians of fewer say little."""
 
-    def applies(
-        self, distance: Float[Tensor, "view"], correlation: Float[Tensor, "view"]
-    ) -> Bool[Tensor, "view"]:
-        """Find the images to which the rule applies, by their distance from and best correlation with the others."""
-        typical = distance.nanmedian()
-        farther = distance > self.lower_ratio * typical
-        unlike = correlation < self.max_correlation * correlation.nanmedian()
+    def applies(self, found: BestAgreement) -> Bool[Tensor, "view"]:
+        """Find the images to which the rule applies, by how well they agree with the others."""
+        distance = found.distance
+        farther = distance > self.lower_ratio * found.typical
+        unlike = found.correlation < self.max_correlation * found.correlation.nanmedian()
         is_large = len(distance) >= self.min_cameras
-        far = (distance > self.ratio * typical) | (farther & unlike & is_large)
+        far = (distance > self.ratio * found.typical) | (farther & unlike & is_large)
         return far & (distance > self.min_distance)
 
 
@@ -84,12 +88,12 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     except ValueError:
         return ()
     colours = surface.colours(small.rgb)
-    distance, correlation = best_agreement(colours)
-    typical = distance.nanmedian()
-    suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
+    found = best_agreement(colours)
+    distance = found.distance
+    suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * distance.nanmedian()]
     better = _find_better_fits(small, surface, colours, distance, suspects)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
-    other_subject = OtherSubjectRule().applies(distance, correlation)
+    other_subject = OtherSubjectRule().applies(found)
     blurred = detail < BLURRED * detail.nanmedian()
     noisy = detail > NOISY * detail.nanmedian()
     mismatch = "its images do not match those of the other cameras"
@@ -101,7 +105,8 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
             texts[view] = f"{mismatch}, and fit much better {better[view]}; correct its files"
         elif bool(other_subject[view]):
             texts[view] = (
-                f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, typically by {100 * typical:.0f} %); "
+                f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, "
+                f"typically by {100 * found.typical[view]:.0f} %); "
                 "check whether they are from another camera or frame, rotated, mirrored, BGR or of another exposure"
             )
         elif bool(blurred[view] | noisy[view]):
@@ -152,9 +157,8 @@ def _find_better_fits(
         images = torch.stack(list(candidates.values())).float() / 255
         sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
         shared = surface.seen[view] & surface.seen
-        distances = dict(
-            zip(candidates, (agreement(rgb, shared, colours, view)[0] for rgb in sampled), strict=True)
-        )
+        each = torch.stack([compare(rgb, shared, colours, view)[0] for rgb in sampled])
+        distances = dict(zip(candidates, each.nan_to_num(torch.inf).amin(1).tolist(), strict=True))
         best = min(distances, key=distances.__getitem__)
         if distances[best] < FITS * float(distance[view]):
             found[view] = best
