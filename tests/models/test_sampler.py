@@ -9,7 +9,7 @@ from reference.rays_reference import sample_fill_reference
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.models.views.aggregation import SampleAggregator
-from viewmend.models.views.config import AROUND, FAR, FEATURES, IN_VIEW, NEAR, OFFSETS, STATISTICS
+from viewmend.models.views.config import AROUND, FAR, IN_VIEW, NEAR, NUM_FEATURES, NUM_STATISTICS, OFFSETS
 from viewmend.models.views.pyramids import (
     MipLevels,
     SceneScale,
@@ -181,11 +181,11 @@ def samples():
     torch.manual_seed(3)
     seen = (torch.rand(150, 3, 5) > 1 / 3).float()
     seen[7, 1] = 0
-    features = torch.rand(150, 3, 5, FEATURES) * seen[..., None]
+    features = torch.rand(150, 3, 5, NUM_FEATURES) * seen[..., None]
     features[..., IN_VIEW] = seen
     prior = torch.rand(150, 3, 5) * seen
     return RaySamples(
-        features, prior / prior.sum(2, keepdim=True).clamp_min(1e-6), torch.rand(150, 3, STATISTICS)
+        features, prior / prior.sum(2, keepdim=True).clamp_min(1e-6), torch.rand(150, 3, NUM_STATISTICS)
     )
 
 

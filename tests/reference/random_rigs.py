@@ -62,7 +62,7 @@ def write_images(folder, rig, frame=None):
 
 def assert_same(calibration, rig):
     """The calibration, or the capture's, is that of the rig."""
-    cameras = getattr(calibration, "_entries", calibration.cameras)
+    cameras = getattr(calibration, "_native_cameras", calibration.cameras)
     assert [camera.name for camera in cameras] == [camera["name"] for camera in rig]
     for read, camera in zip(cameras, rig, strict=True):
         assert (read.width, read.height) == (camera["width"], camera["height"])

@@ -165,9 +165,11 @@ def _line(progress: "Progress") -> str:
 
 def validation_text(scores: "Mapping[str, float | None]") -> str:
     """The latest scores, with a warning if the run overfits; "" without a validation."""
+    from viewmend.training.objective import NEW_VIEWS_SCORE, TRAINED_SCORE
+
     unseen = scores.get("holes")
-    seen = scores.get("holes_seen")
-    alike = scores.get("holes_alike")
+    seen = scores.get(TRAINED_SCORE)
+    alike = scores.get(NEW_VIEWS_SCORE)
     overfit = scores.get("overfit")
     if unseen is None:
         return ""

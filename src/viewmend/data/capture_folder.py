@@ -117,15 +117,12 @@ class CaptureFolder:
         self.name = path.stem if path.is_file() else folder.resolve().name
         """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
-        self._entries = _select(calibration.cameras, cameras, self._file)
-        if masks == "alpha":
-            self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
-        elif masks == "none":
-            self._entries = tuple(replace(camera, mask=None) for camera in self._entries)
-        self.unmasked = _without_masks(self._entries)
+        selected = _with_masks_from(masks, _select(calibration.cameras, cameras, self._file), calibration)
+        self.unmasked = _without_masks(selected)
         """Cameras that are not used, because they have no masks and others do."""
-        self._entries = tuple(camera for camera in self._entries if camera.name not in self.unmasked)
-        self.cameras = pinhole_cameras(self._entries)
+        self._native_cameras = tuple(camera for camera in selected if camera.name not in self.unmasked)
+        """The cameras in use, before undistortion."""
+        self.cameras = pinhole_cameras(self._native_cameras)
         self.clock = read_clock(calibration)
         """When the videos' frames were taken; None for a capture of images."""
         self._num_listed = len(calibration.frames)
@@ -145,7 +142,7 @@ class CaptureFolder:
         self.has_masks = self._cameras_have("mask")
         self.has_depth = self._cameras_have("depth")
         self._readers = tuple(
-            CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries
+            CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._native_cameras
         )
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
@@ -156,7 +153,7 @@ class CaptureFolder:
     def gaps(self) -> tuple[tuple[str, str], ...]:
         """Camera name and frame id of each missing image."""
         missing = np.argwhere(~self.present)
-        return tuple((self._entries[camera].name, self.frame_ids[time]) for camera, time in missing)
+        return tuple((self.cameras.names[camera], self.frame_ids[time]) for camera, time in missing)
 
     @property
     def issues(self) -> tuple[Issue, ...]:
@@ -191,14 +188,14 @@ class CaptureFolder:
         views = [int(view) for view in np.flatnonzero(self.present[:, time])]
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
-            images = list(pool.map(lambda view: self._readers[view].read(time), views))
+            results = list(pool.map(lambda view: self._readers[view].read(time), views))
         self._warn_about_rotation()
-        views = [view for view, image in zip(views, images, strict=True) if image is not None]
-        if not views:
+        images = {view: image for view, image in zip(views, results, strict=True) if image is not None}
+        if not images:
             raise CaptureError(
                 f"{self.folder}: frame '{frame_id}': expected a readable frame in a video, got none; leave it out"
             )
-        frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
+        frame = stack_images(list(images.values()), self.cameras[list(images)], time)
         if frame.mask is not None:
             frame = self._with_opaque_masks(frame)
         if frame.mask is not None and not frame.has_subject:  # only noise, such as that of a compressed video
@@ -215,7 +212,7 @@ class CaptureFolder:
     def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
         """The frame with opaque masks: those with class labels or low grey levels are converted to 0 and 255.
 
-        This is logged at the first frame for the same cameras.
+        A warning names the cameras; it is logged once for the same cameras.
         """
         assert frame.mask is not None
         converted = self._label_masks.convert(frame.mask)
@@ -231,7 +228,7 @@ class CaptureFolder:
         return replace(frame, mask=converted.mask)
 
     def _warn_about_rotation(self) -> None:
-        """Log once which cameras have images that EXIF says to turn, which is not done."""
+        """Log once that images are used as stored, and for which cameras EXIF says that they should be rotated."""
         rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
         if rotated:
             names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
@@ -244,8 +241,10 @@ class CaptureFolder:
 
     def _cameras_have(self, kind: FileKind) -> bool:
         """Whether the cameras have files of this kind; CaptureError if some have and others do not."""
-        missing = [f"camera '{camera.name}'" for camera in self._entries if getattr(camera, kind) is None]
-        if missing and len(missing) < len(self._entries):
+        missing = [
+            f"camera '{camera.name}'" for camera in self._native_cameras if getattr(camera, kind) is None
+        ]
+        if missing and len(missing) < len(self._native_cameras):
             expected = f"'{kind}' for every camera or for none"
             got = f"none for {', '.join(missing)}"
             raise CaptureError(
@@ -266,7 +265,7 @@ class CaptureFolder:
 
         times = range(len(self.frame_ids))
         present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
-        for camera, row in zip(self._entries, present, strict=True):
+        for camera, row in zip(self._native_cameras, present, strict=True):
             if not row.any():
                 raise CaptureError(self._describe_unused_camera(camera, exists))
         empty_frames = np.flatnonzero(~present.any(0)).tolist()
@@ -280,13 +279,16 @@ class CaptureFolder:
         absent: list[FileKind] = [
             kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
         ]
+
+        # The file that is missing in the first frame is named as an example
         if absent:
-            wanted = f"the camera's {absent[0]} in at least one frame"
+            example: FileKind = absent[0]
+            wanted = f"the camera's {example} in at least one frame"
         else:
+            example = kinds[0]
             wanted = f"{' and '.join(kinds)} of the camera in the same frame"
         frame = self.frame_ids[0]
-        kind: FileKind = (absent or list(kinds))[0]
-        path = camera.file(kind, frame)
+        path = camera.file(example, frame)
         where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
         got = f"found none in {len(self.frame_ids)} frames"
         next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
@@ -294,7 +296,7 @@ class CaptureFolder:
 
     def _describe_empty_frame(self, time: int, exists: Callable[[str], bool]) -> str:
         """The error message for a frame in which no camera has all of its files."""
-        # The kinds of files that cameras have, and those of them that no camera has in this frame
+        # The kinds of files in the capture, and which of them all cameras lack in this frame
         readers = {kind: [r for r in self._readers if kind in r.camera.file_kinds] for kind in FILE_KINDS}
         kinds: list[FileKind] = [kind for kind in FILE_KINDS if readers[kind]]
         absent: list[FileKind] = [
@@ -312,7 +314,7 @@ class CaptureFolder:
             got = "no camera that has all"
         _, where = readers[example][0].locate(example, time)
 
-        # What to do: the frame can be removed only where it is listed, or where its images make it a frame
+        # The next step: a `cameras.json` lists its frames, in other formats a frame is a set of images
         steps = ["add them, black ones if there is no subject" if absent == ["mask"] else "add them"]
         if self._file.name == CALIBRATION and self.clock is None:
             steps.append(f"remove the frame from {self._file}")
@@ -335,6 +337,17 @@ def _select(
     return tuple(by_name[name] for name in names)
 
 
+def _with_masks_from(
+    source: MaskSource, cameras: tuple[NativeCamera, ...], calibration: NativeCalibration
+) -> tuple[NativeCamera, ...]:
+    """The cameras with masks from this source only."""
+    if source == "alpha":
+        return tuple(_with_alpha(camera, calibration.folder, calibration.frames) for camera in cameras)
+    if source == "none":
+        return tuple(replace(camera, mask=None) for camera in cameras)
+    return cameras
+
+
 def _without_masks(cameras: Sequence[NativeCamera]) -> tuple[str, ...]:
     """The cameras without masks, if at least two others have some."""
     unmasked = tuple(camera.name for camera in cameras if camera.mask is None)
@@ -348,8 +361,8 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
         raise CaptureError(f"{where}: expected images with alpha, got a video; use another --method")
     files = [folder / camera.file("image", frame) for frame in frames]
     existing = [file for file in files if file.is_file()]
-    if existing and not any(uses_alpha(file) for file in files):
-        # It raises the error of an image without alpha, or of one that cannot be read
+    if existing and not any(uses_alpha(file) for file in existing):
+        # Reading the first image raises the error: it has no alpha, or cannot be read
         read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")
     return replace(camera, mask=camera.image)
 
@@ -369,8 +382,8 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     """Match the videos of a capture by time; None if it has no videos and no offsets.
 
-    The numbered images of a camera count as a video, with the frame rate of the capture, or if it has
-    none, that of the first video. CaptureError if a video cannot be decoded, no two show the same
+    A camera's numbered images are matched like the frames of a video. Their rate is that of the capture or,
+    if it has none, of the first video. CaptureError if a video cannot be decoded, no two show the same
     time, or there are offsets but no frame rate.
     """
     cameras = calibration.cameras
@@ -385,7 +398,7 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     fps = calibration.fps or next((video_properties(file).fps for file in videos.values()), None)
     if fps is None:
         raise CaptureError(f"{calibration.file}: expected fps, which offset_ms needs, got none; add it")
-    numbers_s = np.arange(len(calibration.frames)) / fps
+    numbered_times_s = np.arange(len(calibration.frames)) / fps
     tracks = []
     for camera in cameras:
         offset_s = camera.offset_ms / 1000
@@ -394,7 +407,7 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
             if video is not None:
                 tracks.append(video_track(camera.name, kind, video, offset_s))
             elif kind == "images":  # numbered masks follow their images
-                tracks.append(Track(camera.name, kind, numbers_s, fps, offset_s))
+                tracks.append(Track(camera.name, kind, numbered_times_s, fps, offset_s))
     try:
         return match_tracks(tracks)
     except ValueError as error:

@@ -118,7 +118,7 @@ class VideoClock:
     by_index: frozenset[str]
     """Cameras whose masks have other times, but as many frames as their images, and were matched
     one to one."""
-    timecodes: str | None = None
+    timecode_note: str | None = None
     """A note if the videos start at different timecodes: how different, and whether they were used."""
 
     @property
@@ -155,7 +155,7 @@ class VideoClock:
                 for fault in self._faults(track):
                     faults.setdefault(fault, []).append(track.camera)
         found = tuple(Issue(fault.format(_named(names))) for fault, names in faults.items())
-        return found if self.timecodes is None else (Issue(self.timecodes), *found)
+        return found if self.timecode_note is None else (Issue(self.timecode_note), *found)
 
     def _faults(self, track: Track) -> list[str]:
         """The faults of a video, with {} for the camera."""
@@ -234,7 +234,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     two cameras share a time.
     """
     tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in _with_known_rates(tracks)]
-    tracks, timecodes = _by_timecode(tracks)
+    tracks, timecode_note = _by_timecode(tracks)
     images = {track.camera: track for track in tracks if track.kind == "images"}
     reference = _choose_reference(images.values())
     period_s = 1 / (reference.fps or 1.0)
@@ -262,7 +262,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
         own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, aligned, strict=True)
     )
     end = max(1, int((times < end_s - TOLERANCE * period_s).sum()))
-    return VideoClock(tuple(tracks), reference.fps, times, end, frames, moved, by_index, timecodes)
+    return VideoClock(tuple(tracks), reference.fps, times, end, frames, moved, by_index, timecode_note)
 
 
 def _choose_reference(images: Collection[Track]) -> Track:

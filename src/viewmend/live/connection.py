@@ -97,8 +97,8 @@ class SentMessages:
     """The number of viewers in the last message `stats`."""
     made_ahead: int = 0
     """How many meshes and completed views had been made ahead by the last message `completed`."""
-    listed: dict[FrameKey, int] = field(default_factory=dict)
-    """The number of meshes and completed views of each frame by the last message `completed`."""
+    announced: dict[FrameKey, int] = field(default_factory=dict)
+    """How many meshes and completed views of each frame the messages `completed` have announced."""
 
 
 class ViewerConnection:
@@ -143,8 +143,8 @@ class ViewerConnection:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
                 async with asyncio.timeout(2):
                     await close_with_error(self._socket, closing.code, closing.message)
-        except (WebSocketDisconnect, RuntimeError):  # the client has gone, maybe in the middle of a frame
-            pass
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # the client has gone; starlette raises a RuntimeError when more is sent to it
         finally:
             self._service.leave(self._session)
             with self._service.lock:
@@ -250,6 +250,8 @@ class ViewerConnection:
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
             self._service.lock.notify_all()
+
+        # The page waits for its new clock; what other messages have changed is sent at the next check.
         if isinstance(message, ClockChange):
             self.send_due(self._registry.shared_state())
         self._registry.check_soon(self)
@@ -303,10 +305,12 @@ class ViewerConnection:
             self._sent.state_inputs = inputs
             self._send_state(inputs)
 
-        # Send a view that the serving program wants shown, statistics, and news of what was made ahead.
+        # Send a view that the serving program wants shown, once the page has the rig that it refers to.
         if self._sent.rig is not None and shared.show and shared.show is not self._sent.show:
             self._sent.show = shared.show
             self._send_soon(shared.show)
+
+        # Send statistics, and news of what was made ahead.
         self._send_statistics(shared.viewers)
         if shared.made_ahead != self._sent.made_ahead:
             self._sent.made_ahead = shared.made_ahead
@@ -349,7 +353,7 @@ class ViewerConnection:
         """Send a message `completed` for each frame whose meshes and completed views have changed."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
-            if self._sent.listed.get(key) != count:
+            if self._sent.announced.get(key) != count:
                 index, without = key
                 message = {
                     "type": "completed",
@@ -359,7 +363,7 @@ class ViewerConnection:
                     "mesh": self._service.ahead.mesh(key) is not None,
                 }
                 self._send_soon(message, f"completed {key}")
-        self._sent.listed = counts
+        self._sent.announced = counts
 
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""

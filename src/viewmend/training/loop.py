@@ -16,7 +16,7 @@ from torch.optim.swa_utils import AveragedModel
 from viewmend.models.network import faster_dtype
 from viewmend.training.config import TrainConfig
 from viewmend.training.held_back import PATIENCE, HeldBackValidation, is_better
-from viewmend.training.objective import StepOutput
+from viewmend.training.objective import NEW_VIEWS_SCORE, TRAINED_SCORE, StepOutput, Validation
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import (
     CHECKPOINT,
@@ -99,7 +99,7 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        # Recorded before they exist, so that a run may replace the files of one that was killed
+        # The files are recorded before they exist: if this run is killed, the next may replace them
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)
@@ -229,9 +229,12 @@ class RunClock:
         yield
         self._waited_s += time.monotonic() - began
 
-    def pace(self, step: int, samples: int) -> Pace:
-        """The pace after `step` steps, the last of which had this number of samples."""
-        self._samples += samples
+    def note_samples(self, count: int) -> None:
+        """Note that this number of samples was trained on."""
+        self._samples += count
+
+    def pace(self, step: int) -> Pace:
+        """The pace after `step` steps."""
         span_s = max(time.monotonic() - self._began, 1e-9)
         left_s = (self.config.steps - step) * span_s / (step - self.first_step)
         if self.config.minutes:
@@ -271,10 +274,8 @@ class Run:
             self.state = load_run(last, config, self._modules, self._optimizers)
         self.ddp_objective = processes.wrap_ddp(self.objective)
         self.streams = self._make_streams()
-        self.validation = self.objective.validation if config.validate_every and processes.first else None
         self.keeps_best = bool(config.scenes.hold_out and config.scenes.captures and config.validate_every)
-        if self.keeps_best and processes.first:
-            self.validation = HeldBackValidation(config.scenes.captures, str(config.scenes.hold_out))
+        self.validation = self._make_validation()
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
@@ -283,7 +284,7 @@ class Run:
         step = first
         clock = RunClock(config, first, self.state.elapsed_s)
         with Log(self.out, first, self.processes.first) as log:
-            # The starting weights are scored if they may be the best, or to compare later scores with theirs
+            # Score the starting weights if they may be the best, or are the baseline for later scores
             scores_start = self.keeps_best or self.objective.scores_training_views
             if step == 0 and self.validation is not None and scores_start:
                 self._validate(log, step)
@@ -310,7 +311,8 @@ class Run:
                 step += 1
 
                 # Report it
-                pace = clock.pace(step, sum(map(len, batches)) * self.processes.count)
+                clock.note_samples(sum(map(len, batches)) * self.processes.count)
+                pace = clock.pace(step)
                 entry = Progress(
                     step=step,
                     progress=progress,
@@ -334,6 +336,18 @@ class Run:
             if self.validation is not None and step > first and step % config.validate_every:
                 self._validate(log, step)
 
+    def _make_validation(self) -> Validation | None:
+        """What scores the model: the held-back views of captures if the run keeps the best weights.
+
+        None if nothing is scored in this process.
+        """
+        if not self.config.validate_every or not self.processes.first:
+            return None
+        if self.keeps_best:
+            scenes = self.config.scenes
+            return HeldBackValidation(scenes.captures, str(scenes.hold_out))
+        return self.objective.validation
+
     @property
     def averaged(self) -> nn.Module:
         """The model with averaged weights, which is the result."""
@@ -344,7 +358,7 @@ class Run:
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
-        if "holes_seen" in scores:
+        if TRAINED_SCORE in scores:
             scores |= {"overfit": memorised_gain(scores, first)}
         log.add_validation(step, scores)
         self.last_scores = scores
@@ -497,8 +511,8 @@ def memorised_gain(scores: Mapping[str, float | None], first: Mapping[str, float
         before = first.get(name)
         return None if now is None or before is None else now - before
 
-    on_training_views = gain("holes_seen")
-    on_new_views = gain("holes_alike")
+    on_training_views = gain(TRAINED_SCORE)
+    on_new_views = gain(NEW_VIEWS_SCORE)
     if on_training_views is None or on_new_views is None:
         return None
     return on_training_views - on_new_views

@@ -37,6 +37,10 @@ TILE_PX = 256
 """Each image in the image of a validation has this height, pixels."""
 SHOWN_VIEWS = 8
 """Views in the image of a validation."""
+TRAINED_SCORE = "holes_seen"
+"""A validation has this score for views that the run trains on."""
+NEW_VIEWS_SCORE = "holes_alike"
+"""A validation has this score for new views of the people that the run trains on."""
 Model = TypeVar("Model", bound=nn.Module)
 Validation = Callable[[nn.Module, Path], dict[str, float | None]]
 """Returns the averaged model's mean scores in dB, on fixed views that a run never trains on, and
@@ -78,8 +82,8 @@ class Objective(nn.Module, Generic[Model]):
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
     scores_training_views = False
-    """Whether the validation also scores views that the run trains on ("holes_seen"), and new views of
-    the same people ("holes_alike"). Then the starting weights are scored, too, to compare with."""
+    """Whether the validation also has `TRAINED_SCORE` and `NEW_VIEWS_SCORE`. Then the starting weights are
+    scored, too, to compare with."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()

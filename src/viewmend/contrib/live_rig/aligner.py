@@ -25,7 +25,7 @@ MAX_COMPLETE = 4
 
 @dataclass(frozen=True)
 class TimedImages:
-    """One camera's images and when they were taken, on this machine's monotonic clock."""
+    """One exposure of a camera (image and mask), and when it was taken, on this machine's monotonic clock."""
 
     taken_s: float
     images: CameraImages

@@ -68,8 +68,8 @@ class Playback:
         self.length_s = length_s
         """The length of a lap. When the first recording ends, all of them start again."""
         self.shifts_s: dict[str, float] = {}
-        """Seconds to add to each recording's own times to get times on the timeline, which begins with the
-        earliest image of all recordings. A recording that is not listed begins at the timeline's start."""
+        """A time of a recording plus its shift is a time on the timeline, in seconds. The timeline begins with
+        the earliest image of all recordings. A recording without a shift here begins with the timeline."""
 
     def synchronise(self, tracks: Sequence[Track]) -> str | None:
         """Put these recordings on the timeline, by timecodes if they all have matching ones, otherwise by timestamps.
@@ -88,7 +88,7 @@ class Playback:
         for original, shifted in zip(tracks, matched, strict=True):
             shift_s = float(shifted.times_s[0] - original.times_s[0])
             self.shifts_s[original.camera] = shift_s - first_s
-        return clock.timecodes
+        return clock.timecode_note
 
     def lap_start_s(self, now_s: float) -> float:
         """When the current lap began."""

@@ -146,7 +146,7 @@ class RigFileSource(LiveSource):
             if timecode_note is not None:
                 log.warning("%s", timecode_note)
 
-        # The new rig keeps the event counts of unchanged cameras. `--fps` overrides the file's rate.
+        # `--fps` overrides the file's rate. Unchanged cameras keep their event counts.
         names = tuple(camera.name for camera in rig.cameras)
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
         with self._cameras_lock:
@@ -167,7 +167,8 @@ class RigFileSource(LiveSource):
             return read_images(camera, worker.counts, self._playback, worker.wait)
 
         def wants(taken_s: float, period_s: float) -> bool:
-            return self._aligner.wants(taken_s, period_s)
+            with self._cameras_lock:  # the aligner at this time: a changed rig gets a new one
+                return self._aligner.wants(taken_s, period_s)
 
         return CameraWorker(camera, connect, self._add_image, wants)
 

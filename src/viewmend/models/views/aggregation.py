@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.threads import all_threads, parallel_for
-from viewmend.models.views.config import COLOUR, CONTRAST, FEATURES, IN_VIEW, MASK, STATISTICS
+from viewmend.models.views.config import COLOUR, CONTRAST, IN_VIEW, MASK, NUM_FEATURES, NUM_STATISTICS
 from viewmend.models.views.sampler import RaySamples
 
 BAND = 1024
@@ -40,10 +40,10 @@ class SampleAggregator(nn.Module):
 
     def __init__(self, width: int, channels: int) -> None:
         super().__init__()
-        self.camera = nn.Linear(FEATURES, width)
-        self.all_cameras = nn.Linear(STATISTICS, width)
+        self.camera = nn.Linear(NUM_FEATURES, width)
+        self.all_cameras = nn.Linear(NUM_STATISTICS, width)
         self.trust = nn.Linear(width, 1)
-        inputs = width + FEATURES + 3 + STATISTICS + 1
+        inputs = width + NUM_FEATURES + 3 + NUM_STATISTICS + 1
         self.sample = nn.Sequential(
             nn.Linear(inputs, 2 * width),
             nn.ReLU(),
@@ -89,7 +89,7 @@ class SampleAggregator(nn.Module):
             shared = self.all_cameras(samples.statistics) + self.camera.bias.float()
             weight = self.trust.weight[0].float()
             bias = float(self.trust.bias)
-            inputs = torch.zeros(count, per_ray, len(weight) + FEATURES + 3 + STATISTICS + 1)
+            inputs = torch.zeros(count, per_ray, len(weight) + NUM_FEATURES + 3 + NUM_STATISTICS + 1)
             trust = torch.empty(count, per_ray, views)
             tensors = (
                 samples.features,

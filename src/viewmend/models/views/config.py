@@ -11,7 +11,7 @@ OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.1
 """The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes (`SceneScale.size_m`)."""
 RAY_VIEWS = 4
 """A ray is sampled in this many of the source cameras: those near the viewer that see the proxy's surface."""
-FEATURES = 18
+NUM_FEATURES = 18
 """A ray sample has this many features per camera: the 14 of `CameraFeatures`, RGB minus the
 cameras' mean, and the prior weight."""
 COLOUR = slice(0, 3)
@@ -20,7 +20,7 @@ MASK = slice(3, 4)
 """This feature of a ray sample is the camera's mask."""
 IN_VIEW = 8
 """This feature of a ray sample is 1 if the camera has the sample in view, else 0."""
-STATISTICS = 10
+NUM_STATISTICS = 10
 """A ray sample has this many statistics over cameras; `RayStatistics` names them."""
 NEAR = 0.03
 """The fine distance behind the proxy saturates at this scale, in subject sizes."""

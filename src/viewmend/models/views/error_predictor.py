@@ -11,7 +11,7 @@ from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ErrorMap, RenderQuality
 from viewmend.models.compositing import blend
 from viewmend.models.network import Network
-from viewmend.models.views.config import STATISTICS
+from viewmend.models.views.config import NUM_STATISTICS
 from viewmend.models.views.grid import (
     CELL_PX,
     UNet,
@@ -68,11 +68,11 @@ class ErrorPredictor(Network):
         """`features` is the number of channels at half the resolution."""
         super().__init__()
         self.behind = nn.Sequential(
-            nn.Linear(len(BEHIND) * STATISTICS, 32),
+            nn.Linear(len(BEHIND) * NUM_STATISTICS, 32),
             nn.ReLU(),
             nn.Linear(32, BEHIND_CHANNELS),
         )
-        self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + STATISTICS + BEHIND_CHANNELS, features)
+        self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + NUM_STATISTICS + BEHIND_CHANNELS, features)
         self.head = nn.Conv2d(features, CELL_PX**2 * len(ErrorMap._fields), 1)
 
     def forward(

@@ -28,7 +28,15 @@ from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregator
-from viewmend.models.views.config import COLOUR, FEATURES, MASK, OFFSETS, RAY_VIEWS, RaysConfig, ViewsConfig
+from viewmend.models.views.config import (
+    COLOUR,
+    MASK,
+    NUM_FEATURES,
+    OFFSETS,
+    RAY_VIEWS,
+    RaysConfig,
+    ViewsConfig,
+)
 from viewmend.models.views.error_predictor import ErrorPredictor, fallback_view
 from viewmend.models.views.grid import (
     BAND_PX,
@@ -69,7 +77,7 @@ CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
 sizes (`SceneScale.size_m`)."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """The U-Net gets this many channels of a cell, apart from its ray samples: those of `ViewImage`, the depth
-of the proxy relative to the subject's median depth, and whether the proxy covers the cell."""
+of the proxy relative to the subject's median depth, and whether the proxy or its rim covers the cell."""
 NUM_CANDIDATES = 4
 """A pixel blends this many colours: those in `CandidateColours`."""
 NUM_GAINS = 3 * len(BAND_PX)
@@ -215,21 +223,25 @@ class ViewSynthNet(Network):
             filled = self.fill_holes(view, sources)
         if scale is None:
             scale = SceneScale.of(view)
-        view = replace(view, depth=rim_depth(view.depth))
-        on_proxy = view.depth > 0
-        predicted = on_proxy if where is None else where & on_proxy
+        with_rim = replace(view, depth=rim_depth(view.depth))
+        has_depth = with_rim.depth > 0
+        predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
         if allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM:
-            half_view, half_predicted, half_image = halve(view, predicted, image)
+            half_view, half_predicted, half_image = halve(with_rim, predicted, image)
             distribution = self._depth_distribution(half_view, sources, scale, half_predicted, half_image)
             distribution = distribution._replace(cell_px=2 * CELL_PX)
         else:
-            distribution = self._depth_distribution(view, sources, scale, predicted, image)
-        return self._blend(view, sources, scale, torch.nonzero(predicted), image, distribution)
+            distribution = self._depth_distribution(with_rim, sources, scale, predicted, image)
+        return self._blend(with_rim, sources, scale, torch.nonzero(predicted), image, distribution)
 
     @torch.no_grad()
     def fill_holes(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
-        """The image of the whole view, with holes filled coarsely; from their surroundings only if `quick`."""
+        """The image of the whole view, with holes filled coarsely.
+
+        `RayFill` fills them from the cameras. If `quick`, or if the model has no `RayFill`, they are
+        filled from the pixels around them.
+        """
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
         return self.coarse(replace(view, error=view.holes.to(view.error)), sources).float()
@@ -258,12 +270,12 @@ class ViewSynthNet(Network):
             return None
         filled = self.fill_holes(view, sources, quick=True)
         scale = SceneScale.of(view)
-        view = replace(view, depth=rim_depth(view.depth))
-        predicted = view.depth > 0
+        with_rim = replace(view, depth=rim_depth(view.depth))
+        predicted = with_rim.depth > 0
         image = ViewImage.of(view, filled, predicted)
-        distribution = self._depth_distribution(view, sources, scale, predicted, image)
+        distribution = self._depth_distribution(with_rim, sources, scale, predicted, image)
         pixels = torch.nonzero(predicted)
-        surface = surface_points(view.depth, scale, pixels, distribution)
+        surface = surface_points(with_rim.depth, scale, pixels, distribution)
         found = torch.stack([surface.depth, surface.probability], 1)
         depth, confidence = scatter_to_image(found, pixels, view.mask.shape)
         return DepthMap(depth, confidence)
@@ -292,7 +304,7 @@ class ViewSynthNet(Network):
         where = view.refine_mask & (rim_depth(view.depth) > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # At the lowest quality, holes are filled without the cameras
+        # At the lowest quality, holes are filled without the cameras, if there is anything to inpaint
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
@@ -308,11 +320,13 @@ class ViewSynthNet(Network):
         # Otherwise, the whole subject is predicted, or a fraction of it at reduced quality
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
-        uses_ray_fill = self.coarse is not None and not reduced_quality
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
-        completed = prediction.composite_into(view, where, faded, filled if uses_ray_fill else None)
-        completed, last = steady(completed, where, state)
-        return opaque_in_mask(completed), last
+
+        # Holes also get a share of the colours that `RayFill` found, but not of those from around them
+        used_ray_fill = self.coarse is not None and not reduced_quality
+        completed = prediction.composite_into(view, where, faded, filled if used_ray_fill else None)
+        steadied, new_state = steady(completed, where, state)
+        return opaque_in_mask(steadied), new_state
 
     def _depth_distribution(
         self,
@@ -333,12 +347,12 @@ class ViewSynthNet(Network):
         cameras = choose_cameras(Rays(view, scale, uv_px, choosing_z), sources, RAY_VIEWS)
         rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * proxy_z.new_tensor(OFFSETS), cameras)
 
-        # Further inputs of the U-Net, in all cells: the rendered view, and the depth of the whole proxy
+        # Further inputs of the U-Net, in all cells: the rendered view, and all depth of the proxy and its rim
         whole_depth = nearest_depth(view.depth)
-        on_proxy = whole_depth > 0
-        relative = torch.where(on_proxy, ((whole_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        has_depth = whole_depth > 0
+        relative = torch.where(has_depth, ((whole_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
-        cell_channels = torch.cat([means, relative[None], on_proxy[None].to(means)])
+        cell_channels = torch.cat([means, relative[None], has_depth[None].to(means)])
 
         # Scores of the hypotheses: one from each sample alone, and one from its neighbourhood
         with self.autocast():
@@ -394,21 +408,21 @@ class ViewSynthNet(Network):
 
         # Blend the colours, then add detail
         blended = (scores.softmax(1)[..., None] * colours.stacked()).sum(1)
-        detailed = torch.stack([blended, colours.single, colours.rendered], 1)
+        detail_sources = torch.stack([blended, colours.single, colours.rendered], 1)
         magnification = sources.magnification(view.camera, scale)
-        detail = amplify_detail(detailed, mask, gains, pixels, view.mask.shape, magnification)
+        detail = amplify_detail(detail_sources, mask, gains, pixels, view.mask.shape, magnification)
 
         # Composite on black
         alpha = (alpha_logit[:, 0] + ALPHA_SLOPE * (mask - 0.5)).sigmoid()
         rgb = alpha[:, None] * (blended + detail).clamp(0, 1)
         return ViewPrediction(
-            pixels,
-            rgb,
-            alpha,
-            confidence_logit[:, 0].sigmoid(),
-            surface.depth,
-            aggregated.trust[:, 0],
-            distribution,
+            pixels=pixels,
+            rgb=rgb,
+            alpha=alpha,
+            confidence=confidence_logit[:, 0].sigmoid(),
+            depth=surface.depth,
+            trust=aggregated.trust[:, 0],
+            distribution=distribution,
         )
 
     def _aggregate_pixels(
@@ -428,11 +442,14 @@ class ViewSynthNet(Network):
     ) -> Float[Tensor, "pixel output"]:
         """The last convolutions, at these pixels of an image of this shape."""
         with self.autocast(), all_threads():
+            # Inference on a CPU leaves out the parts of the image that contain none of the pixels
             if inputs.device.type == "cpu" and not torch.is_grad_enabled():
                 return run_tiled(self.blending, features, inputs.to(features), pixels, shape).float()
+
             upsampled = F.interpolate(features, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-            near = crop_to(upsampled[0], shape)
-            out = self.blending(concatenate_channels(near, scatter_to_image(inputs.to(near), pixels, shape)))
+            feature_image = crop_to(upsampled[0], shape)
+            input_image = scatter_to_image(inputs.to(feature_image), pixels, shape)
+            out = self.blending(concatenate_channels(feature_image, input_image))
         rows, columns = pixels.unbind(1)
         return out[0, :, rows, columns].T.float()
 
@@ -442,7 +459,7 @@ def halve(
 ) -> tuple[IncompleteView, Bool[Tensor, "rows columns"], ViewImage]:
     """The view at half its resolution, its pixels to predict, and its `ViewImage`.
 
-    A cell of it covers 4 x 4 pixels of the whole resolution.
+    One of its cells covers 4 x 4 pixels of the full resolution.
     """
     half_predicted = nearest_depth(view.depth * predicted) > 0
     filled = downsample2x(replace(view, rgb=image.filled)).rgb
@@ -521,7 +538,7 @@ def candidate_colours(
 
     # The most trusted camera alone
     best = aggregated.trust[:, 0].argmax(1)
-    best_features = features.gather(1, best[:, None, None].expand(-1, 1, FEATURES))[:, 0]
+    best_features = features.gather(1, best[:, None, None].expand(-1, 1, NUM_FEATURES))[:, 0]
     single = unpremultiply(best_features[:, COLOUR], best_features[:, MASK])
 
     rows, columns = pixels.unbind(1)

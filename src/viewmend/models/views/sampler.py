@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.threads import parallel_for
 from viewmend.models.views.box_sums import BoxSums
-from viewmend.models.views.config import AROUND, CONTRAST, FAR, FEATURES, NEAR, STATISTICS
+from viewmend.models.views.config import AROUND, CONTRAST, FAR, NEAR, NUM_FEATURES, NUM_STATISTICS
 from viewmend.models.views.pyramids import MipLevels, Pyramid, SceneScale, SourceCameras
 from viewmend.types import IncompleteView
 
@@ -104,7 +104,7 @@ class RaySamples(NamedTuple):
     """Samples on rays."""
 
     features: Float[Tensor, "ray sample view feature"]
-    """`CameraFeatures`, stacked; `sample_rays` appends the rest of `config.FEATURES`."""
+    """`CameraFeatures`, stacked; `sample_rays` appends the rest of `config.NUM_FEATURES`."""
     prior: Float[Tensor, "ray sample view"]
     """Initial weights of the cameras: high near the viewer, and where the sample is not far behind
     the proxy. The sum is 1, or 0 where no camera has the sample in view. `sample_fill_rays` sets 0."""
@@ -297,7 +297,9 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     features = _camera_features(rays, sources, at, fine[..., :4], around, behind, torch.tanh)
 
     smallest = _smallest_rig_masks(sources, at_outline, outline_side)
-    return RaySamples(features, 0 * features[..., 0], F.pad(smallest, (STATISTICS - smallest.shape[-1], 0)))
+    return RaySamples(
+        features, 0 * features[..., 0], F.pad(smallest, (NUM_STATISTICS - smallest.shape[-1], 0))
+    )
 
 
 def _camera_features(
@@ -587,10 +589,10 @@ def _sample_numba(
 
     # What the kernels write
     chosen = np.tile(np.arange(len(names)), (count, 1)) if rays.cameras is None else rays.cameras.numpy()
-    channels = sum(CAMERA_CHANNELS) if for_fill else FEATURES
+    channels = sum(CAMERA_CHANNELS) if for_fill else NUM_FEATURES
     features = np.empty((count, samples, chosen.shape[1], channels), np.float32)
     prior = np.zeros((count, samples, chosen.shape[1]), np.float32)
-    statistics = np.ones((count, samples, STATISTICS), np.float32)
+    statistics = np.ones((count, samples, NUM_STATISTICS), np.float32)
     smallest_masks = statistics[..., -STATISTICS_CHANNELS[-1] :]
 
     # What they read of rays and cameras
