@@ -34,7 +34,7 @@ def fuse_geometry(
         config: parameters of the fusion.
 
     Returns:
-        The fused proxy, or the hull as it is where it is empty or no camera can be used.
+        The fused proxy; the hull itself if it is empty, or if no camera can be used.
 
     Raises:
         CancelledError: the result is not needed any more (`cancellable`).
@@ -44,13 +44,13 @@ def fuse_geometry(
     if not len(hull.mesh.vertices):
         return hull
     on_host = cached.frame.cameras.on_host
-    views = surround(
+    cameras = surround(
         on_host, hull.bounds.on_host.center, config.max_views, math.radians(config.min_angle_deg)
     )
     predicted = []
-    for number in range(len(views)):
+    for number in range(len(cameras)):
         stop_if_cancelled()
-        camera = _resized(views[number], hull.bounds, config.view_px).to(cached.frame.rgb.device)
+        camera = _resized(cameras[number], hull.bounds, config.view_px).to(cached.frame.rgb.device)
         found = _predict(cached, camera, model, render)
         if found is not None:
             predicted.append(found)
@@ -60,7 +60,7 @@ def fuse_geometry(
 
 
 def _resized(camera: Cameras, bounds: Bounds, view_px: int) -> Cameras:
-    """The camera with an image in which the longest side of a box spans about this many pixels, or its own if smaller.
+    """The camera, reduced so that the longest side of a box spans at most about this many pixels of its image.
 
     A camera that is next to the box, or inside it, keeps its image.
     """

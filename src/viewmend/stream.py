@@ -138,7 +138,7 @@ class Stream:
             inpainter: completes the views, e.g. `load_inpainter("views")`.
             config: parameters of geometry, rendering and memory.
             bounds: the volume that may contain the subject; None to find it from the masks.
-            error_model: predicts errors, depth and masks in place of `inpainter`, if that does not;
+            error_model: a second model, which predicts errors, depth and masks if `inpainter` does not;
                 needed for the error rule 'predicted', for `RenderQuality.refine_fraction`, for the
                 geometry 'fused' and for `StreamConfig.predict_mask` (`registry.error_model_for`).
 
@@ -252,9 +252,9 @@ class Stream:
     def adopt(self, cached: CachedFrame) -> CachedFrame:
         """Add a frame that another stream has prepared, with its geometry and everything computed from it so far.
 
-        Nothing is copied, and nothing that is computed later is shared. A frame whose time
-        is cached already is not replaced, but it takes over the depths and encodings that
-        it does not have yet.
+        Its data are shared, not copied; what either stream computes later is its own. A frame
+        whose time is cached already is not replaced, but it takes over the depths and encodings
+        that it does not have yet.
 
         Args:
             cached: the frame, on the device on which this stream's views are rendered.
@@ -265,7 +265,7 @@ class Stream:
         own = self.add_frame(cached.frame, cached.proxy)
         own.depths = cached.depths | own.depths
         own.encoded = cached.encoded | own.encoded
-        self._use(cached.frame.time)
+        self._use(cached.frame.time)  # again, because depths and encodings need memory, too
         return own
 
     def _use(self, time: int) -> None:
@@ -352,6 +352,8 @@ class Stream:
         check_exclude(exclude)
         if view.target_mask is not None:  # resampling may overshoot
             view = replace(view, target_mask=view.target_mask.clamp(0, 1).contiguous())
+
+        # A crop saves inpainting; without that, or if the inpainter needs the whole view, there is none
         margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
@@ -376,13 +378,12 @@ class Stream:
         context = self.context_provider(exclude=exclude)
         with all_threads():
             completed, _ = model.step_on(self.config.background, part, context, model.initial_state())
-        found = crop.uncropped(replace(part, target_mask=completed.opacity.clamp(0, 1)), view.camera)
-        assert found.target_mask is not None, "it was just given"
-        return found.target_mask
+        return crop.uncropped_image(completed.opacity.clamp(0, 1), view.camera)
 
     def advance(self, view: IncompleteView, viewer: State | None = None) -> State | None:
         """The state after a view whose completion is not needed; None if only `mend` can compute it."""
         inpainter = self.inpainter
+        # An inpainter with a background of its own puts views on it itself
         background = self.config.background if inpainter.background is None else "black"
         viewer = self.viewer() if viewer is None else viewer
         return inpainter.advance_state(to_background(background, view), viewer)
@@ -436,6 +437,9 @@ class Stream:
             raise ValueError(
                 f"expected a GeometryProxy to render, got {got}; render the view yourself, and use mend"
             )
+
+        # Only the part that shows the subject is rendered. If the inpainter needs the whole view
+        # (a margin of None), `_complete` puts the part into one.
         margin_px = self.inpainter.crop_margin_px(quality)
         if margin_px is None:
             crop = mesh_crop(cached.proxy.mesh.vertices, target, BORDER_PX, 1)
@@ -454,26 +458,27 @@ class Stream:
     ) -> tuple[IncompleteView, float]:
         """The view, or a part of one, with its final E, and the milliseconds spent on encoding cameras for it.
 
-        Without evidence E is only limited by the quality.
+        A view without evidence comes from another renderer, with an E that only the quality may restrict.
         """
-        fraction = self._refine_fraction(quality, by_rule=evidence is not None)
+        fraction = self._refine_fraction(quality, has_evidence=evidence is not None)
         context = self.context_provider(RenderQuality(refine_fraction=fraction), exclude)
         masked = decide_error_mask(
             view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model
         )
         return masked, context.encoding_ms
 
-    def _refine_fraction(self, quality: RenderQuality, by_rule: bool) -> float | None:
+    def _refine_fraction(self, quality: RenderQuality, has_evidence: bool) -> float | None:
         """The largest fraction of the subject's pixels to inpaint; None for no limit.
 
-        The quality may limit it and, with the rule 'predicted', the configuration; the smaller one counts.
+        The quality may limit it and, if the rule 'predicted' decides E from evidence, the configuration. The
+        smaller limit counts.
         """
         if not quality.mend:
             return None
         limits = []
         if quality.refine_fraction is not None:
             limits.append(quality.refine_fraction)
-        if by_rule and self.error_rule == "predicted":
+        if has_evidence and self.error_rule == "predicted":
             limits.append(self.config.render.refine_fraction)
         return min(limits, default=None)
 
@@ -497,14 +502,17 @@ class Stream:
         # predict the subject's mask, if it is needed and not known
         stop_if_cancelled()
         if self._mask_model is not None and part.target_mask is None and _allows_mask(quality):
-            part = replace(part, target_mask=self.predict_mask(part, exclude))
+            mask = self.predict_mask(part, exclude)
+            part = replace(part, target_mask=mask)
             if whole is not None:
-                whole = replace(whole, target_mask=crop.uncropped(part, whole.camera).target_mask)
+                whole = replace(whole, target_mask=crop.uncropped_image(mask, whole.camera))
 
         # decide which pixels are to be inpainted
         stop_if_cancelled()
         masked, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
         stop_if_cancelled()
+
+        # put the part into an empty view, if the inpainter needs the whole view; a given one was not cropped
         needs_whole_view = self.inpainter.crop_margin_px(quality) is None
         if target is not None and needs_whole_view:
             masked = crop.uncropped(masked, target)
@@ -521,7 +529,8 @@ class Stream:
 
         # put the part into the whole view
         if whole is None:
-            whole = crop.uncropped(masked, target or masked.camera)
+            assert target is not None, "without a whole view, its camera is given"
+            whole = crop.uncropped(masked, target)
         completed = crop.pasted(completed, whole)
         self._use(part.time)
         times = StageTimes(geometry=cached.pop_geometry_ms(), context=encoding_ms, inpainting=inpainting_ms)

@@ -109,6 +109,11 @@ class Options:
     json: bool = False
     """Write the scores to standard output as one JSON object, and nothing else."""
 
+    @property
+    def held(self) -> tuple[str, ...]:
+        """The name of the --leave-out camera; empty without one."""
+        return () if self.leave_out is None else (self.leave_out,)
+
 
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
@@ -123,10 +128,10 @@ def run(options: Options) -> int:
     # Open and prepare the capture. Options are checked before anything is read.
     render = options.view.config()
     turntable = parse_turntable(options.path or "")
-    held = () if options.leave_out is None else (options.leave_out,)
+    held = options.held
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
-    usable = _usable(opened, times, held)
+    usable = _find_usable_frames(opened, times, held)
     inpainter = load_named(options.model, options.device, options.precision)
     protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
@@ -157,7 +162,7 @@ def _mend_views(
     from viewmend.data.source import prefetch
     from viewmend.utils.heap import HeapTrimmer
 
-    held = () if options.leave_out is None else (options.leave_out,)
+    held = options.held
     plan_times = [time for time, _ in plan]
     # Successive views of one frame share it, so it is read once.
     frames = prefetch(capture, [time for time, _ in groupby(plan_times)])
@@ -170,7 +175,8 @@ def _mend_views(
         for time, target in track(views, "inpainting", total=len(plan)):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
-            truth = frame.select(held) if options.leave_out in frame.cameras.names else None
+            has_truth = any(name in frame.cameras.names for name in held)
+            truth = frame.select(held) if has_truth else None
             step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
@@ -286,7 +292,7 @@ def _make_mender(
     return Mender(inpainter, config, bounds, held, quality, error_model, protocol)
 
 
-def _usable(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
+def _find_usable_frames(capture: "CaptureFolder", times: range, held: tuple[str, ...]) -> list[int]:
     """The frames with images of two or more input cameras; reports the others, which are skipped.
 
     Raises:

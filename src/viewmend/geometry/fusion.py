@@ -53,8 +53,7 @@ class FusionConfig:
     """Pixels that the longest side of the subject's box spans in the views whose depth is predicted."""
     truncation_voxels: float = 3.0
     """Largest signed distance, in voxels: voxels that are farther in front of a surface count as this
-    far from it. Those that are farther behind it are hidden from the view that sees it, which
-    says nothing about them."""
+    far from it. A view says nothing about voxels that are farther behind the surface that it sees."""
     hull_weight: float = 1.0
     """The hull counts as a view with this confidence. Other views have up to 1."""
     smooth_below: float = 0.2
@@ -118,18 +117,20 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     """
     add_up = _sums_numba if hull.values.device.type == "cpu" else _sums_torch
     # distances times weights, weights, and numbers of views, each summed over the views
-    summed, total, count = add_up(hull, views, config)
+    distances, weights, num_views = add_up(hull, views, config)
 
-    # smooth what is uncertain; a voxel that no view sees is, too, so that there is no step next to it
-    mean_confidence = total / count.clamp_min(1)
+    # smooth where confidence is low, and where no view sees the voxel, so that no steps remain between the two
+    mean_confidence = weights / num_views.clamp_min(1)
     sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
-    sums = torch.stack([summed, total])
-    summed, total = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(sums, sharp.clamp(0, 1))
+    sums = torch.stack([distances, weights])
+    smooth_distances, smooth_weights = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(
+        sums, sharp.clamp(0, 1)
+    )
 
     # add the hull as a view: an occupancy o stands for a signed distance of 1 - 2 o voxels
-    summed += config.hull_weight * (1 - 2 * hull.values)
-    total += config.hull_weight
-    occupancy = 0.5 - 0.5 * summed / total
+    total_distance = smooth_distances + config.hull_weight * (1 - 2 * hull.values)
+    total_weight = smooth_weights + config.hull_weight
+    occupancy = 0.5 - 0.5 * total_distance / total_weight
     return OccupancyGrid(torch.minimum(hull.values, occupancy.clamp_min(0)), hull.low, hull.voxel_m)
 
 

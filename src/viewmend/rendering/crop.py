@@ -56,7 +56,7 @@ class Crop:
         """The whole view of `camera`: black, and without subject, around this part."""
         if self == Crop.all_of(camera):
             return part
-        whole = {name: self._padded(image, camera) for name, image in _images(part).items()}
+        whole = {name: self.uncropped_image(image, camera) for name, image in _images(part).items()}
         return replace(part, camera=camera, **whole)
 
     def pasted(self, part: CompletedView, view: IncompleteView) -> CompletedView:
@@ -64,19 +64,24 @@ class Crop:
         if self == Crop.all_of(view.camera):
             return part
         images = {
-            name: self._padded(image, view.camera) for name, image in part.images.items() if name != "rgb"
+            name: self.uncropped_image(image, view.camera)
+            for name, image in part.images.items()
+            if name != "rgb"
         }
-        error = self._padded(part.view.error, view.camera)
-        fade = None if part.view.fade is None else self._padded(part.view.fade, view.camera)
+        error = self.uncropped_image(part.view.error, view.camera)
+        fade = None if part.view.fade is None else self.uncropped_image(part.view.fade, view.camera)
         rgb = view.cut_rgb
         if part.rgb is not part.view.rgb:
             rgb = rgb.clone()
             self.of_image(rgb).copy_(part.rgb)
         return CompletedView(replace(view, error=error, fade=fade), rgb, **images)
 
-    def _padded(self, image: Tensor, camera: Cameras) -> Tensor:
+    def uncropped_image(
+        self, part: Shaped[Tensor, "*channel _rows _columns"], camera: Cameras
+    ) -> Shaped[Tensor, "*channel _height _width"]:
+        """The whole image of `camera`: 0 around this part."""
         width, height = camera.max_size_px
-        return F.pad(image, (self.left, width - self.right, self.top, height - self.bottom))
+        return F.pad(part, (self.left, width - self.right, self.top, height - self.bottom))
 
 
 def _images(view: IncompleteView) -> dict[str, Tensor]:

@@ -156,7 +156,10 @@ def _colour(
     evidence = Evidence(mask, surface.depth, blended)
     uncoloured = holes(evidence)
     coloured = mask - uncoloured
+
+    # normalise the cameras' weights to a sum of 1
     total = blended.weights.sum(0)
+    weights = blended.weights / total.clamp(min=torch.finfo(total.dtype).tiny) * coloured
 
     silhouettes = None if usable.mask is None else Silhouettes(usable.mask, usable.cameras)
     view = IncompleteView(
@@ -166,7 +169,7 @@ def _colour(
         error=uncoloured,
         depth=surface.depth,
         source_views=source_views,
-        weights=blended.weights / total.clamp(min=torch.finfo(total.dtype).tiny) * coloured,
+        weights=weights,
         time=frame.time,
         candidate_views=candidate_views,
         silhouettes=silhouettes,
@@ -192,12 +195,12 @@ def select_closest(
     target = target.on_host
     cameras = cameras.on_host
     if selection == "direction":
-        distance = -(cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2])
+        cosines = cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2]
+        remoteness = (-cosines).tolist()  # grows with the angle
     else:
-        distance = angles_to(target, cameras, subject_center.cpu())
-    distances = distance.tolist()
-    nearest = sorted(range(len(cameras)), key=lambda view: distances[view])
-    return tuple(cameras.names[view] for view in nearest[:k])
+        remoteness = angles_to(target, cameras, subject_center.cpu()).tolist()
+    closest = sorted(range(len(cameras)), key=remoteness.__getitem__)
+    return tuple(cameras.names[view] for view in closest[:k])
 
 
 def angles_to(target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"]) -> Float[Tensor, "view"]:

@@ -21,7 +21,7 @@ CELL_PX = 2
 TILE_PX = 32
 """The tiles of `run_tiled` have this side, pixels, which is a multiple of `CELL_PX`."""
 TILES_AT_ONCE = (8, 4, 2, 1)
-"""The layers run on one of these numbers of tiles at a time, because convolutions are compiled for each."""
+"""The layers run on one of these numbers of tiles at a time: each other batch size would compile convolutions again."""
 BAND_PX = (3, 7)
 """Means over squares of these sides, pixels, separate the bands of detail. The sides are those for a view
 that shows the subject as large as the source cameras do; see `band_sides_px`."""

@@ -25,7 +25,11 @@ from viewmend.models.views.pyramids import MipLevels, Pyramid, SceneScale, Sourc
 from viewmend.types import IncompleteView
 
 CameraImages = Sequence[tuple]
-"""The images of each camera that are sampled, and their scales."""
+"""One pair for each camera: its images to sample, and the scale from its pixels to those of each image."""
+RGB_MASK = 4
+"""This is the number of a camera image's first channels: RGB on black, and the mask."""
+RGB_MASK_COVERAGE = 5
+"""This is the number of all channels of a camera image: the fifth is 1 where the proxy covers the pixel."""
 CAMERA_CHANNELS = (3, 1, 1, 1, 1, 1, 1, 3, 1, 1)
 """The fields of `CameraFeatures` have these numbers of channels."""
 STATISTICS_CHANNELS = (3, 3, 4)
@@ -38,8 +42,8 @@ CATMULL_ROM = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.
 """Cubic interpolation weighs four values by polynomials of s, the share of the way from the second to
 the third. Row n has the coefficients of s^n."""
 TIE = 1e-7
-"""The score of each camera is lowered by this much per camera before it, so that of equal ones the first is chosen.
-Every camera that has a sample in view has a score above 1e-5."""
+"""Of cameras with equal scores, the first is chosen: each score is lowered by this much for every camera before it.
+Cameras that have a sample in view have scores above 1e-5, so they are still chosen before all others."""
 BAND = 2048
 """A thread takes about this many samples at a time."""
 
@@ -184,7 +188,9 @@ class _Boxes(NamedTuple):
         """The mean of each box, with a border of zeros."""
         from viewmend.models.views._sampler_numba import average_boxes
 
-        rows, columns = (2 - (2 - length) // (self.step * self.side) for length in self.image.shape[:2])
+        # The image and the means have borders of one pixel; boxes at the right and below may be incomplete
+        box_px = self.step * self.side
+        rows, columns = (2 + -(-(length - 2) // box_px) for length in self.image.shape[:2])
         found = np.zeros((rows, columns, self.channels), np.float32)
         average_boxes(self.image.numpy(), self.first, self.step, self.side, found)
         return found
@@ -201,35 +207,38 @@ def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool 
     with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
         if not sources.use_kernels:
             return sample_rays_torch(rays, sources, step_px, cubic)
-        image_levels, outline_levels = sources.levels(rays.view.camera, step_px, rays.scale)
+        image_levels, silhouette_levels = sources.levels(rays.view.camera, step_px, rays.scale)
         images = _at_levels(sources.pyramids, image_levels)
-        outlines = _at_levels(sources.silhouette_pyramids, outline_levels)
-        return _sample_numba(rays, sources, images, outlines, min_coverage=0.0, cubic=cubic)
+        silhouettes = _at_levels(sources.silhouette_pyramids, silhouette_levels)
+        return _sample_numba(rays, sources, images, silhouettes, min_coverage=0.0, cubic=cubic)
 
 
 def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
     """The reference of `sample_rays`."""
-    levels, outlines = sources.mips(rays.view.camera, step_px, rays.scale)
+    levels, silhouettes = sources.mips(rays.view.camera, step_px, rays.scale)
 
-    # Positions in the cameras, and distances behind the proxy there
+    # The cameras chosen for each ray. An index that stands for no camera becomes that of the last one,
+    # which then has no sample in view.
     chosen = None
     last = sources.cameras.K.shape[0] - 1
     if rays.cameras is not None:
         chosen = rays.cameras.clamp_max(last)
         levels = levels.of_cameras(chosen)
-    at, at_outline = _project_into_all(rays, sources, chosen)
+
+    # Positions in the cameras, and distances behind the proxy there
+    projected, in_silhouettes = _project_into_all(rays, sources, chosen)
     if rays.cameras is not None:
-        at = at._replace(in_view=at.in_view & (rays.cameras <= last)[:, None])
-    behind = _distance_behind(rays, sources, at, chosen)
+        projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
+    behind = _distance_behind(rays, sources, projected, chosen)
 
     # What each camera shows
     if cubic:
-        fine = sample_level_cubic(levels.at(0), at, 4)
-        wide = sample_level(levels.at(1), at, 5)
+        fine = sample_level_cubic(levels.at(0), projected, RGB_MASK)
+        wide = sample_level(levels.at(1), projected, RGB_MASK_COVERAGE)
     else:
-        fine, wide = sample_level(levels, at, 5)
-        fine = fine[..., :4]
-    stacked = _camera_features(rays, sources, at, fine, wide, behind, F.softsign, chosen)
+        fine_with_coverage, wide = sample_level(levels, projected, RGB_MASK_COVERAGE)
+        fine = fine_with_coverage[..., :RGB_MASK]
+    stacked = _camera_features(rays, sources, projected, fine, wide, behind, F.softsign, chosen)
     features = CameraFeatures.unstack(stacked)
 
     # Prior weights, and how the cameras differ by them
@@ -241,7 +250,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     difference = features.in_view * (features.colour - mean[:, :, None])
 
     # The silhouettes of the whole rig
-    smallest = _smallest_masks(at_outline, sample_level(outlines, at_outline, 1)[..., 0])
+    smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
     statistics = torch.cat([mean, variance, smallest], -1)
     return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
 
@@ -252,51 +261,64 @@ def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
         return _sample_fill_rays_torch(rays, sources)
     images = [pyramid.levels[0] for pyramid in sources.pyramids]
     masks = [pyramid.levels[0] for pyramid in sources.silhouette_pyramids]
-    shape_side, half_colour_side, outline_side = map(int, _box_sides(*sources.mask_sums))
+    shape_side, half_colour_side, silhouette_side = map(int, _box_sides(*sources.mask_sums))
 
-    # Means of all cameras over boxes: colours of every second pixel, shapes, outlines
-    boxes = [_Boxes(image, first=0, channels=3, step=2, side=half_colour_side) for image in images]
-    boxes += [_Boxes(image, first=3, channels=2, step=1, side=shape_side) for image in images]
-    boxes += [_Boxes(mask, first=0, channels=1, step=1, side=outline_side) for mask in masks]
+    # Means over boxes: colours of every second pixel, shapes (mask and coverage), and silhouettes
+    colour_boxes = [_Boxes(image, first=0, channels=3, step=2, side=half_colour_side) for image in images]
+    shape_boxes = [_Boxes(image, first=3, channels=2, step=1, side=shape_side) for image in images]
+    silhouette_boxes = [_Boxes(mask, first=0, channels=1, step=1, side=silhouette_side) for mask in masks]
+    colours, shapes, rig_masks = _average_all(colour_boxes, shape_boxes, silhouette_boxes)
+
+    # Images and means of each camera, with the scales from its pixels to theirs
+    scales = (1.0, 0.5 / half_colour_side, 1 / shape_side)
+    silhouette_scales = (1.0, 1 / silhouette_side)
+    views = [
+        ((image.numpy(), colour_means, shape_means), scales)
+        for image, colour_means, shape_means in zip(images, colours, shapes, strict=True)
+    ]
+    silhouettes = [
+        ((mask.numpy(), means), silhouette_scales) for mask, means in zip(masks, rig_masks, strict=True)
+    ]
+    return _sample_numba(rays, sources, views, silhouettes, MIN_COVERAGE)
+
+
+def _average_all(*groups: Sequence[_Boxes]) -> list[list[np.ndarray]]:
+    """The means of the boxes of each group, computed on all threads."""
+    boxes = [image_boxes for group in groups for image_boxes in group]
     means: dict[int, np.ndarray] = {}
 
     def work(number: int) -> None:
         means[number] = boxes[number].means()
 
     parallel_for(work, len(boxes))
-
-    # Images and means of each camera, with the scales from its pixels to theirs
-    count = len(images)
-    scales = (1.0, 0.5 / half_colour_side, 1 / shape_side)
-    outline_scales = (1.0, 1 / outline_side)
-    views = [((image.numpy(), means[n], means[count + n]), scales) for n, image in enumerate(images)]
-    outlines = [((mask.numpy(), means[2 * count + n]), outline_scales) for n, mask in enumerate(masks)]
-    return _sample_numba(rays, sources, views, outlines, MIN_COVERAGE)
+    in_order = iter([means[number] for number in range(len(boxes))])
+    return [[next(in_order) for _ in group] for group in groups]
 
 
 def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     """The reference of `sample_fill_rays`."""
     images = sources.images
     depth = MipLevels.full(sources.views.depth[:, None])
-    shape_side, half_colour_side, outline_side = _box_sides(*sources.mask_sums)
+    shape_side, half_colour_side, silhouette_side = _box_sides(*sources.mask_sums)
 
     # Distance behind the proxy: the mean depth of the pixels around that have one
-    at, at_outline = _project_into_all(rays, sources)
-    fine = sample_level(MipLevels.full(images), at, 5)
-    coverage = fine[..., 4]
-    surface = 255 * sample_level(depth, at, 1)[..., 0] / coverage.clamp_min(MIN_COVERAGE)
-    behind = torch.where(coverage > MIN_COVERAGE, at.z_m - surface, 0.0) / rays.scale.size_m
+    projected, in_silhouettes = _project_into_all(rays, sources)
+    fine = sample_level(MipLevels.full(images), projected, RGB_MASK_COVERAGE)
+    coverage = fine[..., RGB_MASK]
+    covered_depth = 255 * sample_level(depth, projected, 1)[..., 0]  # depths are divided by 255, too
+    surface = covered_depth / coverage.clamp_min(MIN_COVERAGE)
+    behind = torch.where(coverage > MIN_COVERAGE, projected.z_m - surface, 0.0) / rays.scale.size_m
 
     # What each camera shows
-    shapes = BoxSums.of(images[:, 3:]).means(at.uv_px, shape_side)
+    shapes = BoxSums.of(images[:, 3:]).means(projected.uv_px, shape_side)
     half = images[:, :3]
-    for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
+    for axis in (2, 3):  # by index: `torch.export` does not know the strides of a slice with steps
         half = half.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
-    colours = BoxSums.of(half).means(at.uv_px / 2, half_colour_side)
+    colours = BoxSums.of(half).means(projected.uv_px / 2, half_colour_side)
     around = torch.cat([colours, shapes], -1)
-    features = _camera_features(rays, sources, at, fine[..., :4], around, behind, torch.tanh)
+    features = _camera_features(rays, sources, projected, fine[..., :RGB_MASK], around, behind, torch.tanh)
 
-    smallest = _smallest_rig_masks(sources, at_outline, outline_side)
+    smallest = _smallest_rig_masks(sources, in_silhouettes, silhouette_side)
     return RaySamples(
         features, 0 * features[..., 0], F.pad(smallest, (NUM_STATISTICS - smallest.shape[-1], 0))
     )
@@ -305,7 +327,7 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
 def _camera_features(
     rays: Rays,
     sources: SourceCameras,
-    at: Projections,
+    projected: Projections,
     fine: Float[Tensor, "ray sample view 4"],
     wide: Float[Tensor, "ray sample view 5"],
     behind: Float[Tensor, "ray sample view"],
@@ -319,13 +341,13 @@ def _camera_features(
         is_source = is_source[chosen][:, None]
     is_source = is_source.expand_as(cosines)
     differences = squash(behind[..., None] / behind.new_tensor([NEAR, FAR])).float()
-    single_channels = torch.stack([cosines, is_source, at.in_view.float()], -1)
+    single_channels = torch.stack([cosines, is_source, projected.in_view.float()], -1)
     features = torch.cat([fine, differences, single_channels, wide], -1)
-    return torch.where(at.in_view[..., None], features, 0.0)
+    return torch.where(projected.in_view[..., None], features, 0.0)
 
 
 def _distance_behind(
-    rays: Rays, sources: SourceCameras, at: Projections, chosen: Int[Tensor, "ray view"] | None = None
+    rays: Rays, sources: SourceCameras, projected: Projections, chosen: Int[Tensor, "ray view"] | None = None
 ) -> Float[Tensor, "ray sample view"]:
     """Distance of samples behind the proxy, in subject sizes, by the depth of the nearest pixel in each camera.
 
@@ -337,10 +359,10 @@ def _distance_behind(
         camera = torch.arange(depth.shape[0], device=depth.device)
     else:
         camera = chosen[:, None]
-    column, row = at.uv_px.long().unbind(-1)
+    column, row = projected.uv_px.long().unbind(-1)
     index = camera * (rows * columns) + row * columns + column
     surface = _look_up(depth.reshape(-1, 1), index)[..., 0].double()
-    return torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
+    return torch.where(surface > 0, projected.z_m - surface, 0.0) / rays.scale.size_m
 
 
 def _closeness(
@@ -364,9 +386,11 @@ def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor
     that have none of these samples in view, the first are chosen. `topk` alone would choose different ones
     in different runtimes.
     """
-    if torch.compiler.is_exporting():  # of any number of cameras
+    # An exported model takes any number of cameras. An index beyond the last stands for no camera.
+    if torch.compiler.is_exporting():
         scores = _without_ties(score_cameras_torch(rays, sources))
         return F.pad(scores, (0, count), value=-1.0).topk(count, 1).indices
+
     if len(sources.cameras) <= count:
         return None
     scores = _score_numba(rays, sources) if sources.use_kernels else score_cameras_torch(rays, sources)
@@ -380,9 +404,9 @@ def _without_ties(scores: Float[Tensor, "ray camera"]) -> Float[Tensor, "ray cam
 
 def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
     """The reference of the scores of `choose_cameras`."""
-    at = project_rays(rays, sources.cameras)
-    near = F.softsign(_distance_behind(rays, sources, at) / NEAR)
-    return (at.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
+    projected = project_rays(rays, sources.cameras)
+    near = F.softsign(_distance_behind(rays, sources, projected) / NEAR)
+    return (projected.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
 
 
 def project_lines(
@@ -426,19 +450,24 @@ def _project_into_all(
     rays: Rays, sources: SourceCameras, chosen: Int[Tensor, "ray view"] | None = None
 ) -> tuple[Projections, Projections]:
     """Projections into the source cameras, or those chosen for each ray, and into the cameras of the silhouettes."""
-    parts = sources.cameras, sources.silhouettes.cameras
-    if torch.compiler.is_exporting():  # which cannot split a number of cameras that it does not know
-        images, outlines = parts
-        return project_rays(rays, images, chosen), project_rays(rays, outlines)
-    counts = [part.K.shape[0] for part in parts]
+    source_cameras = sources.cameras
+    rig = sources.silhouettes.cameras
+    if torch.compiler.is_exporting():  # an exported model cannot split an unknown number of cameras
+        return project_rays(rays, source_cameras, chosen), project_rays(rays, rig)
+
+    # Project into all of them at once. The silhouettes' cameras come after the source cameras.
+    num_sources = source_cameras.K.shape[0]
+    num_rig = rig.K.shape[0]
     index = None
     if chosen is not None:
-        silhouettes = torch.arange(counts[0], sum(counts), device=chosen.device)
-        index = torch.cat([chosen, silhouettes.expand(len(chosen), -1)], 1)
-        counts[0] = chosen.shape[1]
-    together = project_rays(rays, concatenate_cameras([_on_host(part) for part in parts]), index)
-    of_images, of_outlines = zip(*(values.split(counts, 2) for values in together), strict=True)
-    return Projections(*of_images), Projections(*of_outlines)
+        rig_index = torch.arange(num_sources, num_sources + num_rig, device=chosen.device)
+        index = torch.cat([chosen, rig_index.expand(len(chosen), -1)], 1)
+    together = project_rays(rays, concatenate_cameras([_on_host(source_cameras), _on_host(rig)]), index)
+
+    # Split the projections
+    counts = [num_sources if chosen is None else chosen.shape[1], num_rig]
+    of_images, of_silhouettes = zip(*(values.split(counts, 2) for values in together), strict=True)
+    return Projections(*of_images), Projections(*of_silhouettes)
 
 
 def viewing_cosines(
@@ -466,13 +495,13 @@ def viewing_cosines(
 
 
 def sample_level(
-    levels: MipLevels, at: Projections, channels: int
+    levels: MipLevels, projected: Projections, channels: int
 ) -> Float[Tensor, "*level ray sample view channel"]:
     """The first channels of each camera's image, interpolated bilinearly and divided by 255.
 
     Meaningless where a sample is not in view.
     """
-    position = at.uv_px * levels.scale[..., None] + 0.5
+    position = projected.uv_px * levels.scale[..., None] + 0.5
     first = position.floor()
     share = (position - first).float()
     column, row = first.long().unbind(-1)
@@ -508,10 +537,10 @@ def _between_four(
 
 
 def sample_level_cubic(
-    levels: MipLevels, at: Projections, channels: int
+    levels: MipLevels, projected: Projections, channels: int
 ) -> Float[Tensor, "ray sample view channel"]:
     """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
-    position = at.uv_px * levels.scale[..., None] + 0.5
+    position = projected.uv_px * levels.scale[..., None] + 0.5
     first = position.floor()
     share = (position - first).float()
 
@@ -541,30 +570,30 @@ def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
 
 
 def _box_sides(
-    mask_sums: Int[Tensor, "view"], outline_sums: Int[Tensor, "camera"]
+    mask_sums: Int[Tensor, "view"], silhouette_sums: Int[Tensor, "camera"]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sides, in pixels, of boxes of masks, of every second pixel of colours, and of silhouettes."""
     source_px = (mask_sums / 255).mean().sqrt()
-    rig_px = (outline_sums / 255).mean().sqrt()
+    rig_px = (silhouette_sums / 255).mean().sqrt()
     return box_side_px(AROUND, source_px), box_side_px(PATCH / 2, source_px), box_side_px(AROUND, rig_px)
 
 
 def _smallest_rig_masks(
-    sources: SourceCameras, at: Projections, side: Int[Tensor, ""]
+    sources: SourceCameras, projected: Projections, side: Int[Tensor, ""]
 ) -> Float[Tensor, "ray sample 4"]:
     """The smallest masks of all cameras of the rig, single and averaged over boxes of this side."""
     masks = sources.silhouettes.mask[:, None]
-    outlines = sample_level(MipLevels.full(masks), at, 1)
-    means = BoxSums.of(masks).means(at.uv_px, side)
-    return _smallest_masks(at, torch.stack([outlines[..., 0], means[..., 0]]))
+    silhouettes = sample_level(MipLevels.full(masks), projected, 1)
+    means = BoxSums.of(masks).means(projected.uv_px, side)
+    return _smallest_masks(projected, torch.stack([silhouettes[..., 0], means[..., 0]]))
 
 
 def _smallest_masks(
-    at: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
+    projected: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
 ) -> Float[Tensor, "ray sample 4"]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
     # ONNX has no `topk` of an unknown number of cameras
-    seen = torch.where(at.in_view, masks, 1.0)
+    seen = torch.where(projected.in_view, masks, 1.0)
     first = seen.argmin(-1, keepdim=True)
     others = torch.where(torch.arange(seen.shape[-1], device=seen.device) == first, 1.0, seen)
     of_masks, of_means = torch.stack([seen.amin(-1), others.amin(-1)], -1)
@@ -575,7 +604,7 @@ def _sample_numba(
     rays: Rays,
     sources: SourceCameras,
     images: CameraImages,
-    outlines: CameraImages,
+    silhouettes: CameraImages,
     min_coverage: float,
     cubic: bool = False,
 ) -> RaySamples:
@@ -599,8 +628,8 @@ def _sample_numba(
     z = rays.z_m.float().numpy()
     directions = rays.directions.numpy()
     offsets = (sources.cameras.centers.double() - rays.origin).numpy()
-    views = _lines(rays, sources.cameras)
-    silhouettes = _lines(rays, sources.silhouettes.cameras)
+    camera_lines = _lines(rays, sources.cameras)
+    silhouette_lines = _lines(rays, sources.silhouettes.cameras)
     depths = [depth.numpy() for depth in sources.views.per_camera("depth")]
     is_source = [float(name in rays.view.source_views) for name in names]
     size_m = float(rays.scale.size_m)
@@ -610,14 +639,16 @@ def _sample_numba(
     def work(band: int) -> None:
         first = band * band_rays
         end = min(count, first + band_rays)
-        for n, (per_metre, start, size) in enumerate(views):
-            line = (chosen, z, directions, per_metre, start, offsets[n], size)
+        for n, (per_metre, start, size) in enumerate(camera_lines):
+            samples_in_camera = (chosen, z, directions, per_metre, start, offsets[n], size)
             camera = (*images[n], depths[n], size_m, is_source[n])
-            kernels.sample_camera(first, end, n, *line, *camera, min_coverage, cubic, features, prior)
+            kernels.sample_camera(
+                first, end, n, *samples_in_camera, *camera, min_coverage, cubic, features, prior
+            )
         if not for_fill:
             kernels.compare_cameras(first, end, features, prior, statistics)
-        for line, own in zip(silhouettes, outlines, strict=True):
-            kernels.compare_silhouette(first, end, z, *line, *own, smallest_masks)
+        for (per_metre, start, size), (masks, scales) in zip(silhouette_lines, silhouettes, strict=True):
+            kernels.compare_silhouette(first, end, z, per_metre, start, size, masks, scales, smallest_masks)
 
     parallel_for(work, -(-count // band_rays))
     return RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
