@@ -42,7 +42,7 @@ CATMULL_ROM = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.
 """Cubic interpolation weighs four values by polynomials of s, the share of the way from the second to
 the third. Row n has the coefficients of s^n."""
 TIE = 1e-7
-"""Of cameras with equal scores, the first is chosen: each score is lowered by this much for every camera before it.
+"""Each camera's score is lowered by this much for every camera before it, so that the first of equal ones is chosen.
 Cameras that have a sample in view have scores above 1e-5, so they are still chosen before all others."""
 BAND = 2048
 """A thread takes about this many samples at a time."""
