@@ -1,8 +1,9 @@
 """Pure functions that are computed once for equal arguments, because many tests begin with the same scenes."""
 
 import hashlib
+from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache, lru_cache, wraps
 from typing import Any
 
@@ -11,12 +12,18 @@ import pytest
 from torch import Tensor
 
 from viewmend.data import prepare
+from viewmend.geometry.cameras import Cameras
 from viewmend.studio import procedural
+from viewmend.studio.performer import Performer
+from viewmend.studio.stage import Studio
+from viewmend.types import MultiViewFrame
 
 CHECKS = ("diagnose", "shared_offset", "match_colours", "find_loose_masks")
 """The expensive functions of `viewmend.data.prepare`."""
 MAX_SCENES = 16
 """At most this many procedural scenes are remembered; each takes some megabytes."""
+MAX_DRAWN = 100
+"""At most this many frames of the studio are remembered; five images of 96 x 96 pixels take 0.4 MB."""
 
 
 def content_of(value: Any) -> Any:
@@ -45,13 +52,36 @@ def computed_once(function: Callable[..., Any]) -> Callable[..., Any]:
     return remembered
 
 
+def drawn_once() -> Callable[..., MultiViewFrame]:
+    """`Studio._draw` with a memory of the last frames, of which every caller gets a copy."""
+    draw = Studio._draw
+    drawn: OrderedDict[Any, tuple[Performer, MultiViewFrame]] = OrderedDict()
+
+    @wraps(draw)
+    def remembered(studio: Studio, cameras: Cameras, time: int, behind: Tensor | None) -> MultiViewFrame:
+        config = studio.config
+        stage = (id(studio.performer), config.seed, config.fps, config.samples_per_side)
+        key = (*stage, time, content_of(cameras), content_of(behind))
+        if key not in drawn:
+            drawn[key] = studio.performer, draw(studio, cameras, time, behind)
+        drawn.move_to_end(key)
+        if len(drawn) > MAX_DRAWN:
+            drawn.popitem(last=False)
+        _, frame = drawn[key]
+        assert frame.mask is not None
+        assert frame.depth is not None
+        return replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone(), depth=frame.depth.clone())
+
+    return remembered
+
+
 @cache
 def remembering_functions() -> dict[str, Callable[..., Any]]:
     """Replacements of functions of the package, by their places, with one memory for all tests of this process."""
     checks = {f"viewmend.data.prepare.{name}": computed_once(getattr(prepare, name)) for name in CHECKS}
     scene = lru_cache(MAX_SCENES)(procedural.procedural_scene)
     places = ("viewmend.studio.procedural.procedural_scene", "viewmend.scenes.studio_scenes.procedural_scene")
-    return checks | dict.fromkeys(places, scene)
+    return checks | dict.fromkeys(places, scene) | {"viewmend.studio.stage.Studio._draw": drawn_once()}
 
 
 def compute_once(patch: pytest.MonkeyPatch) -> None:

@@ -279,7 +279,8 @@ def test_holes_are_filled_by_the_ray_fill_of_another_model(stored, tmp_path):
 def test_each_term_alone_can_be_minimised(view, term):
     weights = ViewsLossWeights(**dict.fromkeys(vars(ViewsLossWeights()), 0.0) | {term: 1.0})
     objective = make_objective(replace(OPTIONS, loss=weights))
-    optimizer, losses = torch.optim.Adam(objective.parameters(), 3e-3), []
+    optimizer = torch.optim.Adam(objective.parameters(), 3e-3)
+    losses = []
     for _ in range(24):
         torch.manual_seed(5)
         optimizer.zero_grad()
@@ -287,7 +288,9 @@ def test_each_term_alone_can_be_minimised(view, term):
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
-    assert min(losses) < losses[0] - 0.02 * abs(losses[0]), losses
+        if losses[-1] < losses[0] - 0.02 * abs(losses[0]):
+            return
+    pytest.fail(f"the term did not fall by 2 %: {losses}")
 
 
 @pytest.mark.parametrize("ray_views", [2, 4])
