@@ -13,9 +13,14 @@ from viewmend.geometry._hull_numba import NEAR_M, locate
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.hull import (
+    FAINT,
+    ISO,
     HullConfig,
+    OccupancyGrid,
+    any_in_blocks,
     bounds_from_cameras,
     bounds_from_masks,
+    filled_sides,
     needed_views,
     occupied_bounds,
     visual_hull,
@@ -140,6 +145,17 @@ def test_bounds_hold_what_cameras_look_at_and_cameras_that_look_apart_have_none(
     apart = [camera_at((1.0, 0, 0), target=(3.0, 0, 0)), camera_at((-1.0, 0, 0.1), target=(-3.0, 0, 0.1))]
     with pytest.raises(ValueError, match="OpenCV axes"):
         bounds_from_cameras(concatenate_cameras(apart))
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 6), (4, 8, 3), (1, 1, 1)])
+@pytest.mark.parametrize("value", [0.0, FAINT, 0.3, ISO, 0.6])
+def test_a_grid_is_summarised_as_on_a_device(shape, value, rng):
+    """A few voxels have the value, in single precision as on the grid; the others are empty."""
+    values = torch.where(torch.rand(shape, generator=rng) > 0.9, value, 0.0)
+    summary = OccupancyGrid(values, torch.zeros(3), 0.1).summary
+    assert torch.equal(summary.blocks, any_in_blocks(values >= ISO))
+    assert summary.inside == filled_sides(values > ISO)
+    assert summary.filled == filled_sides(values > FAINT)
 
 
 def test_one_camera_is_an_error():

@@ -316,3 +316,28 @@ def bilinear(image, u, v):
     over = np.float32(image[top, left]) * (one - a) + np.float32(image[top, right]) * a
     under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
     return over * (one - b) + under * b
+
+
+@kernel
+def summarise(values, faint, iso, block, blocks, inside, filled):
+    """Mark what values of a grid lie above `faint` and `iso`, of which `faint` is lower.
+
+    `filled` and `inside` are the planes across x, then y, then z with any value above `faint` and
+    `iso`; `blocks` are the cubes of `block` values along each side with any of at least `iso`.
+    """
+    across_y = values.shape[0]
+    across_z = across_y + values.shape[1]
+    for x in range(values.shape[0]):
+        for y in range(values.shape[1]):
+            for z in range(values.shape[2]):
+                value = values[x, y, z]
+                if value > faint:
+                    filled[x] = True
+                    filled[across_y + y] = True
+                    filled[across_z + z] = True
+                    if value >= iso:
+                        blocks[x // block, y // block, z // block] = True
+                    if value > iso:
+                        inside[x] = True
+                        inside[across_y + y] = True
+                        inside[across_z + z] = True

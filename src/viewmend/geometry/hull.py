@@ -94,14 +94,16 @@ class OccupancyGrid:
     @cached_property
     def summary(self) -> GridSummary:
         """The summary of the values, on the CPU; a device is read once."""
-        blocks = any_in_blocks(self.values >= ISO)
-        lines = sum(self.values.shape)
-        parts = [blocks.flatten(), _lines(self.values > ISO), _lines(self.values > FAINT)]
-        blocks_read, inside, filled = torch.cat(parts).cpu().split([blocks.numel(), lines, lines])
+        if _has_kernels(self.values):
+            blocks, inside, filled = _summarise_cpu(self.values)
+        else:
+            in_blocks = any_in_blocks(self.values >= ISO)
+            lines = sum(self.values.shape)
+            parts = [in_blocks.flatten(), _lines(self.values > ISO), _lines(self.values > FAINT)]
+            flat, inside, filled = torch.cat(parts).cpu().split([in_blocks.numel(), lines, lines])
+            blocks = flat.view(in_blocks.shape)
         shape = self.values.shape
-        return GridSummary(
-            blocks_read.view(blocks.shape), _box_of_lines(inside, shape), _box_of_lines(filled, shape)
-        )
+        return GridSummary(blocks, _box_of_lines(inside, shape), _box_of_lines(filled, shape))
 
     @property
     def cubes(self) -> "Cubes":
@@ -213,6 +215,21 @@ def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_bloc
     return padded
 
 
+def _summarise_cpu(
+    values: Float[Tensor, "x y z"],
+) -> tuple[Bool[Tensor, "x_block y_block z_block"], Bool[Tensor, "line"], Bool[Tensor, "line"]]:
+    """The blocks with any voxel inside, and the planes with any above `ISO` and `FAINT`, as in `_lines`."""
+    from viewmend.geometry._hull_numba import summarise
+
+    blocks = torch.zeros([-(-side // PART_BLOCK) for side in values.shape], dtype=torch.bool)
+    inside = torch.zeros(sum(values.shape), dtype=torch.bool)
+    filled = torch.zeros_like(inside)
+    limits = (np.float32(FAINT), np.float32(ISO))  # torch, too, compares in single precision
+    grid = values.detach().contiguous().numpy()
+    summarise(grid, *limits, PART_BLOCK, blocks.numpy(), inside.numpy(), filled.numpy())
+    return blocks, inside, filled
+
+
 def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:
     """How many of `views` cameras must see a point for it to count; `cut_off` of them see the subject in part."""
     usual = math.ceil(config.min_fraction * views)
@@ -246,8 +263,8 @@ def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
     return float(size.median()) if len(size) else 1.0
 
 
-def _has_kernels(mask: Tensor) -> bool:
-    return mask.device.type == "cpu"
+def _has_kernels(data: Tensor) -> bool:
+    return data.device.type == "cpu"
 
 
 def kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:

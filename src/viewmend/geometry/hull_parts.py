@@ -77,9 +77,10 @@ def _surface(inside: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
 
 
 def _to_voxels(blocks: Bool[Tensor, "x_block y_block z_block"]) -> Bool[Tensor, "x y z"]:
-    for axis in range(3):
-        blocks = blocks.repeat_interleave(PART_BLOCK, axis)
-    return blocks
+    sides = [length for side in blocks.shape for length in (side, PART_BLOCK)]
+    return (
+        blocks[:, None, :, None, :, None].expand(sides).reshape([PART_BLOCK * side for side in blocks.shape])
+    )
 
 
 def _unneeded(
