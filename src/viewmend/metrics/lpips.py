@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from viewmend.metrics.weights import checked_weights, known_weights
-from viewmend.utils.weight_files import load_weights
+from viewmend.utils.weight_files import construct, load_weights
 
 Backbone = Literal["alex", "vgg"]
 MEAN = (0.485, 0.456, 0.406)
@@ -100,7 +100,7 @@ def load_lpips(backbone: Backbone = "alex", device: torch.device | str = "cpu") 
         [0.0, 0.0]
     """
     path = checked_weights(known_weights(f"lpips-{backbone}"))
-    network = load_weights(Lpips(backbone), path, device).requires_grad_(False)
+    network = load_weights(construct(Lpips, backbone), path, device).requires_grad_(False)
     # A fifth faster on CPUs.
     return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 

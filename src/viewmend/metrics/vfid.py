@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.metrics.weights import checked_weights, known_weights
-from viewmend.utils.weight_files import load_weights
+from viewmend.utils.weight_files import construct, load_weights
 
 Mode = Literal["eval", "train"]
 MODES: tuple[Mode, ...] = ("eval", "train")
@@ -71,7 +71,8 @@ def load_i3d(device: torch.device | str = "cpu") -> I3d:
         MissingWeightsError: the file is not installed.
         WeightsError: the file is damaged or a different one.
     """
-    return load_weights(I3d(), checked_weights(known_weights("i3d")), device).requires_grad_(False)
+    path = checked_weights(known_weights("i3d"))
+    return load_weights(construct(I3d), path, device).requires_grad_(False)
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ from viewmend.utils.weight_files import (
     DamagedWeightsError,
     MismatchedWeightsError,
     WeightsError,
+    construct,
     load_weights,
     read_weights,
 )
@@ -88,7 +89,7 @@ def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -
         raise MismatchedWeightsError(
             f"{folder}: expected the {needed} weights of its {CONFIG}, got {size} bytes of {WEIGHTS}; copy both files"
         )
-    network = load_weights(build(config), folder / WEIGHTS, device)
+    network = load_weights(construct(build, config), folder / WEIGHTS, device)
     if str(name_or_path) == RAYS and isinstance(network, ViewSynthNet) and network.coarse is not None:
         return network.coarse
     return network

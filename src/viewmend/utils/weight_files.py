@@ -1,11 +1,13 @@
 """Strict loading of network weights: no code is executed, and every name and shape must match."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from viewmend.utils.untrusted_input import InputError
 
@@ -34,6 +36,22 @@ class DamagedWeightsError(WeightsError):
 
 class MismatchedWeightsError(WeightsError):
     """A file that does not hold weights, or holds those of another network."""
+
+
+class _NoRandomWeights(TorchFunctionMode):
+    """Functions of `torch.nn.init` that draw random numbers leave a tensor as it is."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if getattr(func, "__module__", "") == nn.init.__name__:
+            return kwargs["tensor"]
+        return func(*args, **kwargs)
+
+
+def construct(make: Callable[..., Network], *arguments: Any) -> Network:
+    """Call `make`, whose network is about to get its weights from a file, without drawing random weights."""
+    with _NoRandomWeights():
+        return make(*arguments)
 
 
 def load_weights(network: Network, path: str | Path, device: torch.device | str = "cpu") -> Network:

@@ -9,7 +9,7 @@ from torch import nn
 
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ
 from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
-from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, load_weights
+from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, construct, load_weights
 
 NETWORKS = {"DSTT": DSTT, "FuseFormer": FuseFormer, "E2FGVI": E2FGVI, "E2FGVI_HQ": E2FGVIHQ}
 
@@ -20,7 +20,9 @@ def test_keys_and_shapes_are_the_published_ones(name, shared):
     for line in (shared / "parity" / f"keys_{name}.txt").read_text().splitlines():
         key, shape = line.split(" ", 1)
         listed[key] = tuple(int(side) for side in shape.strip("()").split(",") if side.strip())
-    assert {key: tuple(value.shape) for key, value in NETWORKS[name]().state_dict().items()} == listed
+    assert {
+        key: tuple(value.shape) for key, value in construct(NETWORKS[name]).state_dict().items()
+    } == listed
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,14 @@ def test_official_weights_load_in_each_form(form, weights, tmp_path):
     assert all(torch.equal(value, weights[key]) for key, value in network.state_dict().items())
 
 
+def test_a_network_that_gets_its_weights_from_a_file_draws_none():
+    before = torch.random.get_rng_state()
+    network = construct(DSTT)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert network.state_dict().keys() == DSTT().state_dict().keys()
+    assert not torch.equal(torch.random.get_rng_state(), before), "on its own it does"
+
+
 def saved(path, contents):
     torch.save(contents, path)
     return path
@@ -57,18 +67,18 @@ def test_another_networks_weights_are_refused(weights, tmp_path):
     with pytest.raises(
         MismatchedWeightsError, match=r"expected the 160 tensors of FuseFormer, got 158: \d+ missing"
     ):
-        load_weights(FuseFormer(), path)
+        load_weights(construct(FuseFormer), path)
     # HQ and plain E2FGVI differ in one bias alone.
-    path = saved(tmp_path / "E2FGVI.pth", E2FGVI().state_dict())
+    path = saved(tmp_path / "E2FGVI.pth", construct(E2FGVI).state_dict())
     with pytest.raises(
         MismatchedWeightsError, match=r"2 missing \(sc.bias_conv.bias.*1 unknown \(sc.bias ...\)"
     ):
-        load_weights(E2FGVIHQ(), path)
+        load_weights(construct(E2FGVIHQ), path)
     wrong = weights | {"patch2vec.bias": torch.zeros(7)}
     with pytest.raises(
         MismatchedWeightsError, match=r"1 of another shape \(patch2vec.bias \(7,\) for \(512,\) "
     ):
-        load_weights(fresh(), saved(tmp_path / "x.pth", wrong))
+        load_weights(construct(DSTT), saved(tmp_path / "x.pth", wrong))
 
 
 def test_absent_counters_do_not_matter(tmp_path):
@@ -93,7 +103,7 @@ def test_damaged_files_are_refused(form, weights, tmp_path):
     for part in (b"", whole[:100], whole[: len(whole) // 2], whole[:-1]):
         path.write_bytes(part)
         with pytest.raises(DamagedWeightsError, match=f"got {len(part)} bytes that do not read"):
-            load_weights(fresh(), path)
+            load_weights(construct(DSTT), path)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +111,7 @@ def test_damaged_files_are_refused(form, weights, tmp_path):
 )
 def test_files_without_weights_are_refused(contents, tmp_path):
     with pytest.raises(MismatchedWeightsError, match="expected a dictionary of tensors"):
-        load_weights(fresh(), saved(tmp_path / "x.pth", contents))
+        load_weights(construct(DSTT), saved(tmp_path / "x.pth", contents))
 
 
 class Trap:
@@ -123,5 +133,5 @@ def test_no_code_in_a_checkpoint_is_run(saver, weights, tmp_path):
     else:
         path.write_bytes(pickle.dumps(trap, protocol=2))
     with pytest.raises(DamagedWeightsError, match="do not read"):
-        load_weights(fresh(), path)
+        load_weights(construct(DSTT), path)
     assert not (tmp_path / "trace").exists()

@@ -17,7 +17,7 @@ from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter, Sam
 from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
 from viewmend.metrics.weights import KnownWeights, checked_weights, known_weights
 from viewmend.models.base import Inpainter
-from viewmend.utils.weight_files import load_weights
+from viewmend.utils.weight_files import construct, load_weights
 
 NETWORKS: dict[str, Callable[[], DSTT | FuseFormer | E2FGVI]] = {
     "dstt": DSTT,
@@ -59,7 +59,7 @@ def load_baseline(
         path = path / TRAINED if path.is_dir() else path
     else:
         path = checked_weights(finetuned_weights(network) if weights else known_weights(network))
-    return load_weights(NETWORKS[network](), path, device)
+    return load_weights(construct(NETWORKS[network]), path, device)
 
 
 def finetuned_weights(network: str) -> KnownWeights:

@@ -23,7 +23,7 @@ from viewmend.models.base import ContextProvider, Inpainter, State
 from viewmend.models.compositing import blend
 from viewmend.models.smooth_fill import fill
 from viewmend.types import CompletedView, IncompleteView
-from viewmend.utils.weight_files import load_weights
+from viewmend.utils.weight_files import construct, load_weights
 
 Image = Float[Tensor, "3 height width"]
 FlowMap = Float[Tensor, "2 height width"]
@@ -181,4 +181,4 @@ def make_rgvi(device: torch.device | str = "cpu") -> Rgvi:
         from torchvision.models.optical_flow import raft_large  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError(f"expected torchvision to run {path}, found none; pip install torchvision") from None
-    return Rgvi(partial(raft_flow, load_weights(raft_large(), path, device)))
+    return Rgvi(partial(raft_flow, load_weights(construct(raft_large), path, device)))
