@@ -37,6 +37,19 @@ def test_large_bounds_cost_no_detail(bounds):
     assert volume(loose.mesh) == pytest.approx(volume(tight.mesh), rel=0.03)
 
 
+def test_faint_space_apart_from_the_subject_costs_no_detail():
+    """Values below one half in all masks at another place, as phantoms leave them."""
+    cameras = dome(8, fov=1.2)
+    masks = ball_masks(cameras, radius=0.3)
+    expected = reconstruct(masks, cameras, around(1.0), CONFIG)
+    faint = ball_masks(cameras, center=(0.0, 0.8, 0.0), radius=0.12) // 255 * 100
+    found = reconstruct(masks.maximum(faint), cameras, around(1.0), CONFIG)
+    assert float(found.bounds.size_m.max()) <= float(expected.bounds.size_m.max())
+    assert volume(found.mesh) == pytest.approx(volume(expected.mesh), rel=0.02)
+    nothing_else = reconstruct(faint, cameras, around(1.0), CONFIG)
+    assert len(nothing_else.mesh.vertices) == 0 and float(nothing_else.bounds.low[1]) > 0.5
+
+
 def test_masks_that_contradict_give_an_empty_proxy():
     """Rendering must survive a moment at which nothing is left."""
     cameras = dome(4)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.geometry.hull import ISO, PART_BLOCK, OccupancyGrid
+from viewmend.geometry.hull import FAINT, ISO, PART_BLOCK, Box, OccupancyGrid, any_in_blocks, filled_sides
 from viewmend.geometry.sampling import in_view
 
 CELL = 1.25
@@ -21,6 +21,8 @@ real cameras disagree by strips at the outline, which a part can cover by chance
 SPECK = 4
 """A part is not needed either if it covers at most this many cells of each image on its own, such
 as a speck next to a hand. The largest part stays unless the others cover it."""
+SHELL_BLOCKS = 2
+"""Faint voxels within this many blocks of the voxels inside belong to them, without a search."""
 MANY = 2000
 """Distinct numbers are found by marking them if there are at least this many, else by sorting."""
 
@@ -54,6 +56,36 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
     outside = grid.values < ISO
     remove = _to_voxels(blocks.to(device))[:x, :y, :z] | (_to_voxels(around.to(device))[:x, :y, :z] & outside)
     return replace(grid, values=grid.values.masked_fill(remove, 0.0))
+
+
+def filled_box(grid: OccupancyGrid) -> Box | None:
+    """The box of all voxels that are not surely empty and connected with one inside; None for an empty grid.
+
+    Faint voxels elsewhere are what is left around floating parts, or rays that nearly cross. If no
+    voxel is inside, all that are not surely empty count.
+    """
+    from scipy.ndimage import label
+
+    filled = grid.summary.filled
+    inside = grid.summary.inside
+    if filled is None or inside is None:
+        return filled
+    shell = SHELL_BLOCKS * PART_BLOCK
+    beyond = [
+        max(own.start - side.start, side.stop - own.stop) for side, own in zip(filled, inside, strict=True)
+    ]
+    if max(beyond) <= shell:
+        return filled
+    faint_blocks = any_in_blocks(grid.values > FAINT).cpu()
+    labels, _ = label(faint_blocks.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    connected = np.unique(labels[grid.summary.blocks.numpy()])
+    of_blocks = filled_sides(torch.from_numpy(np.isin(labels, connected)))
+    assert of_blocks is not None, "there are voxels inside"
+    x, y, z = (
+        slice(max(side.start, PART_BLOCK * blocks.start), min(side.stop, PART_BLOCK * blocks.stop))
+        for side, blocks in zip(filled, of_blocks, strict=True)
+    )
+    return x, y, z
 
 
 def _grown(blocks: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:

@@ -17,7 +17,7 @@ from viewmend.geometry.hull import (
     occupied_bounds,
     visual_hull,
 )
-from viewmend.geometry.hull_parts import without_floating_parts
+from viewmend.geometry.hull_parts import filled_box, without_floating_parts
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface
@@ -91,8 +91,8 @@ def reconstruct(
 
 
 def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
-    """The box of all that is not surely empty, with two voxels around it, within `bounds`; None for an empty grid."""
-    sides = grid.summary.filled
+    """The `filled_box` of the grid, with two voxels around it, within `bounds`; None for an empty grid."""
+    sides = filled_box(grid)
     if sides is None:
         return None
     first = torch.tensor([max(side.start - 1, 0) for side in sides])
