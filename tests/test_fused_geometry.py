@@ -67,7 +67,7 @@ def test_the_hull_follows_the_depth_that_is_predicted():
     target = camera_at(77, "novel", 96)
 
     def depth_m(model) -> float:
-        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), FusionConfig())
+        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), FusionConfig(view_px=96))
         return float(proxy.depth(target)[0, 48, 48])
 
     # Views from the side move the surface that faces the target by less than the full distance.

@@ -42,14 +42,14 @@ class FusionConfig:
         8
     """
 
-    resolution: int = 160
+    resolution: int = 224
     """Voxels along the longest side of the subject's box."""
-    max_views: int = 24
+    max_views: int = 16
     """Largest number of views whose depth is predicted. The rig's cameras come first, then virtual
     cameras in the gaps between them."""
     min_angle_deg: float = 8.0
     """Smallest angle between two of these views, as seen from the subject, in degrees."""
-    view_px: int = 240
+    view_px: int = 480
     """Pixels that the longest side of the subject's box spans in the views whose depth is predicted."""
     truncation_voxels: float = 3.0
     """Largest signed distance, in voxels: voxels that are farther in front of a surface count as this

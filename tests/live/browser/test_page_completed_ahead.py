@@ -58,12 +58,12 @@ def complete_for_ever(*order):
         time.sleep(0.01)
 
 
-def shown_area(browser, server, mode: str) -> float:
-    """The share of the canvas that a moving view covers, once the page has the fused mesh."""
+def shown_area(browser, server, mode: str, last_asset: str) -> float:
+    """The share of the canvas that a moving view covers, once the page has the fused mesh and this asset."""
     asked = set()
     with opened(browser, server, query=f"?time=0&mode={mode}") as view:
         view.page.on("request", lambda request: asked.update(re.findall(r"assets/0/(\w+)", request.url)))
-        view.until(lambda: "mesh" in asked, SCREENSHOT_S)
+        view.until(lambda: {"mesh", last_asset} <= asked, SCREENSHOT_S)
         view.page.wait_for_timeout(500)
         with silent(server):
             view.drag(120, 0)
@@ -71,10 +71,14 @@ def shown_area(browser, server, mode: str) -> float:
             return float((view.picture().max(-1) > 60).mean())
 
 
-def test_a_moving_view_is_drawn_on_the_fused_mesh_unless_it_is_shown_as_rendered(browser):
+@pytest.mark.parametrize("with_completed", [False, True])
+def test_a_moving_view_is_drawn_on_the_fused_mesh_unless_it_is_shown_as_rendered(browser, with_completed):
     with running(inpainter=SmallerFill(), completed_cameras=COUNT) as server:
-        server.service.renderer.complete_virtual_camera = complete_for_ever
-        rendered = shown_area(browser, server, "rendered")
-        completed = shown_area(browser, server, "completed")
+        last_asset = str(len(CAMERAS) + COUNT - 1)
+        if not with_completed:
+            server.service.renderer.complete_virtual_camera = complete_for_ever
+            last_asset = "mesh"
+        rendered = shown_area(browser, server, "rendered", last_asset)
+        completed = shown_area(browser, server, "completed", last_asset)
     assert rendered > 0.02
     assert 0.1 * rendered < completed < 0.8 * rendered

@@ -220,7 +220,7 @@ export class Scene {
    */
   prepare(frame, eye, modes) {
     for (const mode of modes) {
-      const drawn = this.#chooseMesh(frame, eye, mode);
+      const drawn = this.#chooseMesh(frame, mode);
       const cached = this.cache.get(drawn) ?? this.#uploadMesh(drawn);
       this.cache.delete(drawn);
       this.cache.set(drawn, cached);
@@ -236,18 +236,14 @@ export class Scene {
 
   /**
    * Choose between the mesh of the hull and the mesh fused from predicted depth. The fused mesh is used if
-   * there is one, except where the view is shown as rendered. Completed views cut off what the hull
-   * over-estimates, but cannot show what the fused mesh lacks, so they are drawn on the hull.
+   * there is one, except where the view is shown as rendered.
    * @param {Frame} frame
-   * @param {number[]} eye
    * @param {string} mode
    * @returns {Frame}
    */
-  #chooseMesh(frame, eye, mode) {
-    if (!frame.fused || mode === "rendered" || mode === "holes") return frame;
-    const { cameras } = /** @type {any} */ (frame.shape).header;
-    const { first } = this.#chooseCameras(frame, eye, mode);
-    return first.some((n) => cameras[n].completed) ? frame : frame.fused;
+  #chooseMesh(frame, mode) {
+    const isRendered = mode === "rendered" || mode === "holes";
+    return frame.fused && !isRendered ? frame.fused : frame;
   }
 
   /**
@@ -286,7 +282,7 @@ export class Scene {
    */
   draw(wholeFrame, viewer, eye, mode, viewport, background) {
     const { gl } = this;
-    const frame = this.#chooseMesh(wholeFrame, eye, mode);
+    const frame = this.#chooseMesh(wholeFrame, mode);
     const cached = this.cache.get(frame);
     const { header } = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
     const { first, fill } = this.#chooseCameras(frame, eye, mode);
