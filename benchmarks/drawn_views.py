@@ -1,10 +1,11 @@
 """Score views as the page draws them while they move: python benchmarks/drawn_views.py [--sets SET ...].
 
 In each scene a camera is left out. Its view is drawn by the page's own code in Chromium, from the cameras' images alone
-(`page`) and from completed virtual cameras too (`page+virtual`), and completed by the model itself (`views`). SET is P,
-CAPTURE:INPUTS, for example ../shared/captures/wd2:8, or turn: a studio seen by six cameras 60 degrees apart, along the
-way from one to the next. Of the virtual cameras only those are completed that the page uses at the pose, which gives
-the same pixels as all of them.
+(`page`) and from completed virtual cameras too (`page+virtual`), both on the fused mesh, and completed by the model
+itself behind the hull, as a live view at rest is (`views`). SET is P, CAPTURE:INPUTS, for example
+../shared/captures/wd2:8, or turn: a studio seen by six cameras 60 degrees apart, along the way from one to the next.
+Of the virtual cameras only those are completed that the page uses at the pose, which gives the same pixels as all of
+them.
 
 Columns: PSNR of the whole view on black; LPIPS (AlexNet) in the subject's box, and its ratio to that of `views`. Then,
 for a time of each set: bytes of mesh and images; bytes and processor seconds of all completed views, from the mean of
@@ -36,7 +37,6 @@ from whole_views import detail_scores, perceptual_metrics
 
 from viewmend.completed_cameras import MAX_COMPLETED, complete_views, place_around, with_finer_images
 from viewmend.evaluation.scores import TrueView, true_view
-from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.assets import COMPLETED_SOURCES, FrameAssets, make_assets
@@ -51,7 +51,6 @@ from viewmend.scenes.studio_scenes import procedural_set
 from viewmend.stream import Geometry, Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.types import Silhouettes
 
 SETS = ("../shared/captures/wd2:8", "../shared/captures/utrecht:all", "P", "turn")
 TURN_SEED = 10001
@@ -121,6 +120,8 @@ class SetScores:
     """Bytes of a completed view."""
     view_cpu_s: list[float] = field(default_factory=list)
     """Processor seconds of a completed view."""
+    fusion_cpu_s: list[float] = field(default_factory=list)
+    """Processor seconds of a frame's fused geometry; empty if the hull is drawn."""
     paint_ms: dict[str, list[float]] = field(default_factory=dict)
     """Milliseconds of a painted view."""
 
@@ -163,7 +164,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8, help="number of views per set, evenly spaced")
     parser.add_argument("--size", type=int, default=320, help="width and height of the views of P and turn")
     parser.add_argument(
-        "--geometry", choices=get_args(Geometry), default="hull", help="the mesh that is drawn"
+        "--geometry", choices=get_args(Geometry), default="fused", help="the mesh that is drawn"
     )
     parser.add_argument(
         "--paints", type=int, default=10, help="a view is painted this many times to be timed"
@@ -231,6 +232,14 @@ def draw(
     completed = stream.view(target, time=cached.frame.time).completed
     pictures = {"views": composite("black", completed.rgb, completed.opacity).clamp(0, 1)}
 
+    if geometry == "fused":
+        start_s = time.process_time()
+        stream = Stream(model, StreamConfig(memory_mb=None, geometry="fused"), frame.bounds)
+        cached = stream.add_frame(frame.inputs)
+        proxy = cached.proxy
+        assert isinstance(proxy, GeometryProxy), "no other geometry was given"
+        scores.fusion_cpu_s.append(time.process_time() - start_s)
+
     # the virtual cameras that the page uses at this pose
     rig = frame.inputs.cameras
     ring = with_finer_images(place_around(rig, proxy.center, None, MAX_COMPLETED))
@@ -240,12 +249,6 @@ def draw(
     start_s = time.process_time()
     views = complete_views(stream, cached, virtual)
     scores.view_cpu_s.append((time.process_time() - start_s) / len(virtual))
-    if geometry == "fused":
-        assert frame.inputs.mask is not None, "the frame has a hull"
-        masks = Silhouettes(frame.inputs.mask, rig)
-        start_s = time.process_time()
-        proxy = fuse_geometry(cached, masks, model, stream.config.render, stream.config.fusion)
-        print(f"fused in {time.process_time() - start_s:.1f} s of processor time", flush=True)
     plain = make_assets(frame.inputs, proxy, stream.config.render)
     host.frame = make_assets(frame.inputs, proxy, stream.config.render, views)
     scores.real_bytes.append(plain.size_bytes)
@@ -310,6 +313,8 @@ def report(name: str, scores: SetScores) -> dict[str, Any]:
         "completed_mb": MAX_COMPLETED * fmean(scores.view_bytes) / 1e6,
         "completed_cpu_s": MAX_COMPLETED * fmean(scores.view_cpu_s),
     }
+    if scores.fusion_cpu_s:
+        cost["fusion_cpu_s"] = fmean(scores.fusion_cpu_s)
     print(f"  a time: {json.dumps({key: round(value, 2) for key, value in cost.items()})}", flush=True)
     return table | {"cost": cost}
 

@@ -21,6 +21,7 @@ from reference.ball import BallCapture, camera_at, photograph, ring
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from viewmend.geometry.fusion import FusionConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.live.client import Client
 from viewmend.live.frame_source import RecordedSource
@@ -47,7 +48,9 @@ class SmallerFill(SmoothFill):
 
 
 CAMERAS = ring(12)[[0, 1, 2, 4, 7, 9]]
-PIPELINE = StreamConfig(hull=HullConfig(resolution=32))
+PIPELINE = StreamConfig(
+    hull=HullConfig(resolution=32), fusion=FusionConfig(resolution=64, max_views=8, view_px=64)
+)
 WAIT_S = 60.0
 """How long anything may take on a busy machine."""
 

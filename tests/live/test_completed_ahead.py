@@ -242,6 +242,21 @@ def test_a_mesh_is_fused_on_another_device(monkeypatch):
         assert fused(device) == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize("without", [(), ("c1",)])
+def test_views_are_completed_behind_the_fused_mesh_of_their_frame(without):
+    renderer = Renderer(Ball(), SmallerFill(), PIPELINE, completed_cameras=2)
+    assert renderer.prepare(0)
+
+    def shown_px(index: int) -> int:
+        image = renderer.complete_virtual_camera(index, without, 0)
+        return int((read_image(image.asset.content, image.camera)[1] > 127).sum())
+
+    behind_hull = shown_px(0)
+    renderer.fuse_mesh(0, without)
+    assert 0.1 * behind_hull < shown_px(0) < 0.8 * behind_hull
+    assert shown_px(1) == pytest.approx(behind_hull, rel=0.1), "frame 1 has no fused mesh"
+
+
 def test_without_a_page_that_draws_nothing_is_completed_ahead():
     with running(completed_cameras=4) as server, open_websocket(server) as viewer:
         say_hello(viewer)

@@ -57,7 +57,7 @@ class Options:
     """Seed of the scene of 'studio'; by default one that no model was trained with."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
-    geometry: Geometry = "hull"
+    geometry: Geometry = "fused"
     """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the
     model 'views' predicts all around the subject. Fusing adds the time of several views to each
     frame."""

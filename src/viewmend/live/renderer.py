@@ -142,6 +142,8 @@ class Renderer:
         """The initial view; None before the first frame."""
         self.virtual_cameras: Cameras | None = None
         """The cameras around the subject whose views are completed ahead; None if none are."""
+        self._fused: tuple[tuple[int, tuple[str, ...]], Stream] | None = None
+        """The frame of the last fused mesh and the cameras that it leaves out, with a stream that holds it alone."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
         self.assets_version: str | None = None
@@ -188,6 +190,7 @@ class Renderer:
         fps = self._source.span.fps or None
         self.rig_json = rig_json(rig.name, cameras, bounds or proxy.bounds, home, fps, version)
         self._variants.clear()
+        self._fused = None
         if self._completed_cameras:
             around = place_around(cameras.to("cpu"), home.center, rig.up, self._completed_cameras)
             self.virtual_cameras = with_finer_images(around)
@@ -305,21 +308,34 @@ class Renderer:
         return self._completed_cameras > 0 and self._depth_model is not None
 
     def fuse_mesh(self, index: int, without: tuple[str, ...]) -> Asset:
-        """A frame's mesh, fused from its hull and predicted depth; errors as `render`."""
+        """A frame's mesh, fused from its hull and predicted depth; errors as `render`.
+
+        If the model that completes views predicts depth itself, the frame's virtual cameras are then
+        completed behind this mesh.
+        """
         assert self._depth_model is not None, "see `makes_meshes_ahead`"
         left_out = self.left_out(without)
-        cached = self._add_frame(self._stream_of(None, left_out), index, left_out)
+        stream = self._stream_of(None, left_out)
+        cached = self._add_frame(stream, index, left_out)
         masks = all_masks(cached.frame)
         render = self._config.render
         proxy = fuse_geometry(cached, masks, self._depth_model, render, self._config.fusion)
+        if self._depth_model is self._inpainter:
+            fused = Stream(self._inpainter, self._config, stream.bounds, self._error_model)
+            fused.add_frame(cached.frame, geometry=proxy)
+            self._fused = ((index, left_out), fused)
         return make_mesh(cached.frame.to("cpu"), proxy.to("cpu"), render)
 
     def complete_virtual_camera(self, index: int, without: tuple[str, ...], number: int) -> CompletedImage:
         """The view of a virtual camera, as a further source image of a frame; errors as `render`."""
         assert self.virtual_cameras is not None, "a rig was prepared, whose views are completed ahead"
         left_out = self.left_out(without)
-        stream = self._stream_of(None, left_out)
-        cached = self._add_frame(stream, index, left_out)
+        if self._fused is not None and self._fused[0] == (index, left_out):
+            stream = self._fused[1]
+            cached = stream.cached_frame(stream.times[0])
+        else:
+            stream = self._stream_of(None, left_out)
+            cached = self._add_frame(stream, index, left_out)
         cameras, images = completed_assets(complete_views(stream, cached, self.virtual_cameras[[number]]))
         return CompletedImage(cameras[0] | {"number": len(cached.frame.cameras) + number}, images[0])
 
