@@ -218,8 +218,10 @@ class CaptureFolder:
         converted = self._label_masks.convert(frame.mask)
         if converted is None:
             return frame
-        cameras = ", ".join(frame.cameras.names[view] for view in converted.views or ())
-        masks = "masks" if converted.views is None else f"masks of {cameras}"
+        if converted.views is None:  # those of all cameras
+            masks = "masks"
+        else:
+            masks = f"masks of {', '.join(frame.cameras.names[view] for view in converted.views)}"
         if masks not in self._logged_conversions:
             self._logged_conversions.add(masks)
             logging.getLogger("viewmend").warning(
@@ -358,7 +360,7 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
     """The camera with its images as masks; raises a CaptureError if none of its images has alpha."""
     if camera.image is None:
         where = f"{folder}: camera '{camera.name}'"
-        raise CaptureError(f"{where}: expected images with alpha, got a video; use another --method")
+        raise CaptureError(f"{where}: expected images with alpha, got a video; use another source of masks")
     files = [folder / camera.file("image", frame) for frame in frames]
     existing = [file for file in files if file.is_file()]
     if existing and not any(uses_alpha(file) for file in existing):

@@ -96,9 +96,11 @@ class SentMessages:
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     made_ahead: int = 0
-    """How many meshes and completed views had been made ahead by the last message `completed`."""
+    """`SharedState.made_ahead` at the last messages `completed`. While it stays the same, there is nothing to
+    announce."""
     announced: dict[FrameKey, int] = field(default_factory=dict)
-    """How many meshes and completed views of each frame the messages `completed` have announced."""
+    """How many meshes and completed views of each frame these messages have announced. Only frames with
+    another number are announced again."""
 
 
 class ViewerConnection:
@@ -295,8 +297,8 @@ class ViewerConnection:
         now = self._now()
         self._send_new_rig()
 
-        # Send the state if its inputs have changed. The inputs do not include the states of extensions,
-        # nor the frame of a clock that plays behind the live edge: in these cases, always compute the state.
+        # Compute the state, and send it if it is new, when its inputs have changed. Do so at every check if it
+        # may change without them: with extensions, or with a clock that plays behind the live edge.
         plays_behind = self._service.source.span.live and session.clock.playing and not session.clock.live
         changes_by_itself = bool(self._registry.extensions) or plays_behind
         is_overdue = now - self._sent.state_s >= STATE_S
@@ -369,6 +371,7 @@ class ViewerConnection:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
         # A frame changes the statistics twice: when it is sent, and when it drops out of them a second later.
+        # So a frame that was sent less than a second before the last message changes them again.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

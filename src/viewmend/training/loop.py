@@ -99,7 +99,8 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        # The files are recorded before they exist: if this run is killed, the next may replace them
+        # The files are recorded before they exist, and as changing during the run: if it is killed, the next
+        # run may replace them
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)

@@ -21,9 +21,9 @@ from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
 
 FIRST_PAUSE_S = 0.1
-"""The first pause between attempts to connect, in seconds; it doubles each time."""
+"""Attempts to connect begin at least this many seconds apart at first; the pause doubles each time."""
 MAX_PAUSE_S = 1.0
-"""The longest pause between attempts to connect, in seconds."""
+"""The pause between the beginnings of attempts to connect grows to this many seconds."""
 POLL_S = 0.2
 """A thread that waits for images checks at this interval, in seconds, whether it has to end."""
 PERIOD_GAIN = 0.05

@@ -282,7 +282,7 @@ class ViewSynthNet(Network):
 
     def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
         """Computes the image pyramids of these cameras, which `context` keeps for later views."""
-        SourceCameras.of(views, None, context)
+        SourceCameras.of(views, silhouettes=None, context=context)  # `context` keeps what this computes
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """See `Inpainter.crop_margin_px`."""
@@ -308,21 +308,20 @@ class ViewSynthNet(Network):
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
-        # Without a pixel to predict, or without a camera, the view is only attenuated
+        # Without a pixel to predict, or without a camera, the view is at most attenuated
         sources = None
         if bool(where.any()):
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
-        if sources is None and view.fade is None:
-            return CompletedView(view, view.rgb), state
         if sources is None:
-            return fallback_view(view, faded), state
+            completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
+            return completed, state
 
         # Otherwise, the whole subject is predicted, or a fraction of it at reduced quality
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
 
-        # Holes also get a share of the colours that `RayFill` found, but not of those from around them
+        # In holes, the prediction is blended with the coarse fill, if `RayFill` has made it
         used_ray_fill = self.coarse is not None and not reduced_quality
         completed = prediction.composite_into(view, where, faded, filled if used_ray_fill else None)
         steadied, new_state = steady(completed, where, state)
@@ -352,7 +351,7 @@ class ViewSynthNet(Network):
         has_depth = whole_depth > 0
         relative = torch.where(has_depth, ((whole_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image.stacked())
-        cell_channels = torch.cat([means, relative[None], has_depth[None].to(means)])
+        cell_channels = concatenate_channels(means, relative[None], has_depth[None].to(means))
 
         # Scores of the hypotheses: one from each sample alone, and one from its neighbourhood
         with self.autocast():
@@ -360,9 +359,7 @@ class ViewSynthNet(Network):
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             stop_if_cancelled()
             with all_threads():
-                features = self.unet.forward_points(
-                    inputs, cells, concatenate_channels(cell_channels.to(inputs))
-                )
+                features = self.unet.forward_points(inputs, cells, cell_channels.to(inputs))
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
         cell_index = index_image(cells, proxy_depth.shape)
         return DepthDistribution(cells, cell_index, proxy_depth, logits, samples, cameras, features)
