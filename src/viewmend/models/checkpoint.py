@@ -11,7 +11,7 @@ from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.config import RaysConfig, ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.utils.atomic_writes import write_tensors, write_text
+from viewmend.utils.atomic_writes import write_text
 from viewmend.utils.untrusted_input import bounded_bytes, read_json
 from viewmend.utils.weight_files import (
     DamagedWeightsError,
@@ -20,6 +20,7 @@ from viewmend.utils.weight_files import (
     construct,
     load_weights,
     read_weights,
+    write_tensors,
 )
 
 FORMAT = 3

@@ -13,8 +13,9 @@ from torch.optim import Optimizer
 
 from viewmend.training.config import TrainConfig
 from viewmend.training.replay import ReplayPosition
-from viewmend.utils.atomic_writes import TEMPORARY, name_path_in_errors, write_tensors, write_text
+from viewmend.utils.atomic_writes import TEMPORARY, name_path_in_errors, write_text
 from viewmend.utils.untrusted_input import InputError
+from viewmend.utils.weight_files import write_tensors
 
 CHECKPOINT = "run.safetensors"
 """The last checkpoint has this name."""

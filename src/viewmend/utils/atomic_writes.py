@@ -5,13 +5,9 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-from safetensors import SafetensorError
-from safetensors.torch import save_file
-from torch import Tensor
 
 TEMPORARY = ".half-"
 """Prefix of the temporary name."""
@@ -106,33 +102,6 @@ def is_running(process: str) -> bool:
     except (OSError, OverflowError) as error:
         return not isinstance(error, ProcessLookupError)
     return True
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a safetensors file atomically; tensors may be on any device.
-
-    Raises:
-        OSError: it cannot be written.
-        FloatingPointError: a value is not finite; an existing file at `path` is unchanged.
-    """
-    plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-    broken = [
-        key for key, value in plain.items() if value.is_floating_point() and not bool(value.isfinite().all())
-    ]
-    if broken:
-        raise FloatingPointError(
-            f"{path}: expected finite values, got NaN or infinity in {len(broken)} of {len(plain)} tensors "
-            f"({broken[0]}); the file is unchanged: resume from it with a lower learning rate"
-        )
-
-    def write(temporary: Path) -> None:
-        try:
-            save_file(plain, temporary, dict(metadata))
-        except SafetensorError as error:
-            raise OSError(f"{path}: expected space for the file, got: {error}; free some space") from error
-        temporary.chmod(0o644)
-
-    write_atomically(path, write, durable=True)
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -1,14 +1,16 @@
-"""Strict loading of network weights: no code is executed, and every name and shape must match."""
+"""Files of network weights: written atomically, loaded strictly (all names and shapes), and no code is executed."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from safetensors.torch import load_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from viewmend.utils.atomic_writes import write_atomically
 from viewmend.utils.untrusted_input import InputError
 
 WRAPPER = "netG"
@@ -132,3 +134,30 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             "network's weights"
         )
     return found
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a safetensors file atomically; tensors may be on any device.
+
+    Raises:
+        OSError: it cannot be written.
+        FloatingPointError: a value is not finite; an existing file at `path` is unchanged.
+    """
+    plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+    broken = [
+        key for key, value in plain.items() if value.is_floating_point() and not bool(value.isfinite().all())
+    ]
+    if broken:
+        raise FloatingPointError(
+            f"{path}: expected finite values, got NaN or infinity in {len(broken)} of {len(plain)} tensors "
+            f"({broken[0]}); the file is unchanged: resume from it with a lower learning rate"
+        )
+
+    def write(temporary: Path) -> None:
+        try:
+            save_file(plain, temporary, dict(metadata))
+        except SafetensorError as error:
+            raise OSError(f"{path}: expected space for the file, got: {error}; free some space") from error
+        temporary.chmod(0o644)
+
+    write_atomically(path, write, durable=True)

@@ -18,7 +18,7 @@ from viewmend.export.traceable import ViewInputs, ViewOutputs
 from viewmend.models.checkpoint import load_inpainter, save_inpainter
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.utils.atomic_writes import write_tensors
+from viewmend.utils.weight_files import write_tensors
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8, coarse_fill="rays")

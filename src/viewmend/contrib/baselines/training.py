@@ -38,8 +38,9 @@ from viewmend.training.config import ObjectiveConfig, SamplingConfig, SceneConfi
 from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, load_start
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.scenes import sample_scenes, validation_scenes
-from viewmend.utils.atomic_writes import write_tensors, write_text
+from viewmend.utils.atomic_writes import write_text
 from viewmend.utils.options import HIDDEN
+from viewmend.utils.weight_files import write_tensors
 
 Framing = Literal["def", "win", "mul"]
 FRAMINGS: tuple[Framing, ...] = ("def", "win", "mul")
