@@ -8,7 +8,8 @@ mesh, a decimated one, splatted points, or a noisy depth map.
 
 Columns: LPIPS in the subject's box; `sharpness`, the mean gradient of the view over that of the truth; `damaged`, the
 share of the pixels off by less than 0.05 as rendered that are off by more than 0.15 afterwards; `calibration`, the mean
-distance of the confidence from the share of pixels that are correct, in ten bins of confidence.
+distance of the confidence from the share of pixels that are correct, in ten bins of confidence. For P and Q, the depth
+of the proxy in the view is also compared with the true depth.
 """
 
 import argparse
@@ -42,7 +43,7 @@ from viewmend.scenes.studio_scenes import StudioScene, performer_set, procedural
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
 from viewmend.training.views import CORRECT_DIFFERENCE
-from viewmend.types import CompletedView
+from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.weight_files import MissingWeightsError
 
@@ -62,6 +63,8 @@ CELL_M, POINTS = 0.05, 40_000
 """Of decimated meshes and splatted points."""
 NOISY = DepthErrors(noise_m=0.004, waves_m=0.008, step_m=0.008, holes=0.03)
 RIGHT, WRONG = 0.05, 0.15
+FAR_OFF_M = 0.05
+"""Depth that is off by more than this is far off, metres."""
 PADDING_PX = 16
 
 
@@ -123,9 +126,12 @@ def judge(
     """Print and return the mean scores of each model."""
     scores: dict[str, list[dict[str, float | None]]] = {model: [] for model in options.models}
     scorers, metrics = Scorers(options.background), perceptual_metrics()
+    depths: list[dict[str, float]] = []
     for number, scene in enumerate(scenes):
         shown = {}
         for model, completed, truth in completed_views(scene, options, number):
+            if isinstance(scene, StudioScene) and model == options.models[0]:
+                depths.append(depth_scores(completed.view, scene))
             own = score_view(completed, truth, scorers)
             rgb = composite(options.background, completed.rgb, completed.opacity)
             rendered = composite(options.background, completed.view.rgb, completed.view.mask)
@@ -143,7 +149,29 @@ def judge(
     for model, own in means.items():
         figures = (value if (value := own[key]) is not None else float("nan") for key in SHOWN)
         print(f"  {model:28s}", *(f"{figure:7.4f}" for figure in figures), flush=True)
+    if depths:
+        mean_depths = {key: round(fmean(own[key] for own in depths), 4) for key in depths[0]}
+        print(f"  depth of the proxy: {mean_depths}", flush=True)
     return means
+
+
+def depth_scores(view: IncompleteView, scene: StudioScene) -> dict[str, float]:
+    """Errors of the proxy's depth in a view: millimetres where the truth has depth too, and shares of the true surface.
+
+    "extra" are pixels with depth where there is no surface.
+    """
+    true_depth = rasterize(scene.studio().scene(0).mesh, view.camera).depth[0]
+    there = true_depth > 0
+    found = view.depth > 0
+    error_m = (view.depth - true_depth)[there & found].abs()
+    surface_px = float(there.sum())
+    return {
+        "mean_mm": 1e3 * float(error_m.mean()),
+        "median_mm": 1e3 * float(error_m.median()),
+        "far_off": float((error_m > FAR_OFF_M).sum()) / surface_px,
+        "missing": float((there & ~found).sum()) / surface_px,
+        "extra": float((found & ~there).sum()) / surface_px,
+    }
 
 
 def perceptual_metrics() -> dict[str, Lpips]:

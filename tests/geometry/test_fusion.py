@@ -27,6 +27,7 @@ def fuse(request, monkeypatch):
     """`fuse_occupancy` by each of the two fast paths; returns the values."""
     if request.param == "torch":
         monkeypatch.setattr(fusion, "_sums_numba", fusion._sums_torch)
+        monkeypatch.setattr(fusion, "_vote_numba", fusion._vote_torch)
     return lambda *arguments: fuse_occupancy(*arguments).values
 
 

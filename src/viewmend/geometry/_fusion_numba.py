@@ -47,3 +47,37 @@ def sum_distances(slab, occupancy, P, size_px, low, depth, confidence, voxel_m, 
             sums[0, slab, j, k] = summed
             sums[1, slab, j, k] = total
             sums[2, slab, j, k] = count
+
+
+@kernel
+def vote(slab, occupancy, sums, hull_weight, smooth_below, sharp_above, fused):
+    """Fill one slab of the fused occupancy from what `sum_distances` found, where the hull's occupancy is not 0.
+
+    Sums of neighbours beyond the grid count as 0, as in the mean over all voxels of `_vote_torch`.
+    """
+    rows = occupancy.shape[1]
+    columns = occupancy.shape[2]
+    for j in range(rows):
+        for k in range(columns):
+            filled = occupancy[slab, j, k]
+            if filled <= 0:
+                continue
+            distances = sums[0, slab, j, k]
+            weights = sums[1, slab, j, k]
+            mean_confidence = weights / max(sums[2, slab, j, k], 1.0)
+            sharp = min(max((mean_confidence - smooth_below) / (sharp_above - smooth_below), 0.0), 1.0)
+
+            # the mean over 27 voxels, where depth is uncertain
+            if sharp < 1:
+                distances_around = 0.0
+                weights_around = 0.0
+                for x in range(max(slab - 1, 0), min(slab + 2, occupancy.shape[0])):
+                    for y in range(max(j - 1, 0), min(j + 2, rows)):
+                        for z in range(max(k - 1, 0), min(k + 2, columns)):
+                            distances_around += sums[0, x, y, z]
+                            weights_around += sums[1, x, y, z]
+                distances = sharp * distances + (1 - sharp) * distances_around / 27
+                weights = sharp * weights + (1 - sharp) * weights_around / 27
+
+            distance = (distances + hull_weight * (1 - 2 * filled)) / (weights + hull_weight)
+            fused[slab, j, k] = min(filled, max(0.5 - 0.5 * distance, 0.0))

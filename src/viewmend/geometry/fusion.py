@@ -115,23 +115,46 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
     its camera, weighted by the confidence. `config.truncation_voxels` limits distances in
     front of the surface; a view says nothing about voxels that are farther behind it.
     """
-    add_up = _sums_numba if hull.values.device.type == "cpu" else _sums_torch
-    # distances times weights, weights, and numbers of views, each summed over the views
-    distances, weights, num_views = add_up(hull, views, config)
+    on_cpu = hull.values.device.type == "cpu"
+    add_up = _sums_numba if on_cpu else _sums_torch
+    take_vote = _vote_numba if on_cpu else _vote_torch
+    return OccupancyGrid(take_vote(hull.values, add_up(hull, views, config), config), hull.low, hull.voxel_m)
+
+
+def _vote_numba(
+    occupancy: Float[Tensor, "x y z"], sums: Float[Tensor, "3 x y z"], config: FusionConfig
+) -> Float[Tensor, "x y z"]:
+    """What `_vote_torch` returns, by compiled loops on all threads."""
+    from viewmend.geometry._fusion_numba import vote
+
+    hull = occupancy.contiguous().numpy()
+    fused = np.zeros_like(hull)
+
+    def work(slab: int) -> None:
+        vote(slab, hull, sums.numpy(), config.hull_weight, config.smooth_below, config.sharp_above, fused)
+
+    parallel_for(work, hull.shape[0])
+    return torch.from_numpy(fused)
+
+
+def _vote_torch(
+    occupancy: Float[Tensor, "x y z"], sums: Float[Tensor, "3 x y z"], config: FusionConfig
+) -> Float[Tensor, "x y z"]:
+    """The fused occupancy, given the hull's occupancy and what the views say about each voxel."""
+    _, weights, num_views = sums
 
     # smooth where confidence is low, and where no view sees the voxel, so that no steps remain between the two
     mean_confidence = weights / num_views.clamp_min(1)
     sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
-    sums = torch.stack([distances, weights])
-    smooth_distances, smooth_weights = F.avg_pool3d(sums, 3, stride=1, padding=1).lerp(
-        sums, sharp.clamp(0, 1)
+    weighted = sums[:2]
+    smooth_distances, smooth_weights = F.avg_pool3d(weighted, 3, stride=1, padding=1).lerp(
+        weighted, sharp.clamp(0, 1)
     )
 
     # add the hull as a view: an occupancy o stands for a signed distance of 1 - 2 o voxels
-    total_distance = smooth_distances + config.hull_weight * (1 - 2 * hull.values)
+    total_distance = smooth_distances + config.hull_weight * (1 - 2 * occupancy)
     total_weight = smooth_weights + config.hull_weight
-    occupancy = 0.5 - 0.5 * total_distance / total_weight
-    return OccupancyGrid(torch.minimum(hull.values, occupancy.clamp_min(0)), hull.low, hull.voxel_m)
+    return torch.minimum(occupancy, (0.5 - 0.5 * total_distance / total_weight).clamp_min(0))
 
 
 def _sums_numba(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> Float[Tensor, "3 x y z"]:
