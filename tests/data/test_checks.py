@@ -436,6 +436,27 @@ def test_inverted_masks_are_fatal_from_half_of_them_on(ball, count):
         )
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_an_empty_mask_is_named_for_inputs_and_for_held_out_cameras(ball, held):
+    mask = ball.mask.clone()
+    mask[3] = 0
+    names = ball.cameras.names
+    inputs = [name for name in names if name != names[3] or not held]
+    (issue,) = find_bad_masks(replace(ball, mask=mask), inputs, None)
+    assert issue.camera == (None if held else names[3])
+    assert f"camera '{names[3]}': its mask is empty" in issue.text
+    assert ("scores against it are meaningless" in issue.text) == held
+    assert find_bad_masks(replace(ball, mask=0 * mask), inputs, None) == ()
+
+
+def test_a_camera_whose_mask_is_empty_is_not_called_early(moving):
+    capture = open_capture(moving)
+    frames = [capture.read(time) for time in range(7)]
+    for frame in frames[3:]:
+        frame.mask[3] = 0
+    assert synchronisation.find_desynchronised_camera(frames, 3, capture.bounds) == ()
+
+
 def chequered(times, delay=0, view=1, size=64):
     """A square in front of a wall, moving two pixels per frame. The images of one camera are delayed."""
     grid = torch.arange(size) // 4 % 2

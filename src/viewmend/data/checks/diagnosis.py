@@ -120,8 +120,8 @@ def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds 
     """Find masks that are inverted, or empty although the other input cameras see the subject there.
 
     Returns one issue per camera, or a single fatal one if at least half of the masks are inverted.
-    A camera that is not an input is judged by its own mask alone and is not left out, since results
-    are scored against it; it does not affect the judgement of other cameras.
+    A camera that is not an input is not left out, since results are scored against it; it does not affect
+    the judgement of other cameras.
     """
     if frame.mask is None:
         return ()
@@ -142,29 +142,38 @@ def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds 
         effect = "it is left out" if name in inputs else "scores against it are meaningless"
         text = f"camera '{name}': its mask is {what}, so {effect}; {next_step}"
         issues.append(Issue(text, camera=name if name in inputs else None))
-    good = [name for name in names if name in inputs and name not in inverted]
-    return (*issues, *(_find_empty_masks(frame.select(good), bounds) if len(good) > 2 else ()))
+    judged = [name for name in names if name not in inverted]
+    good = [name for name in judged if name in inputs]
+    return (*issues, *(_find_empty_masks(frame.select(judged), good, bounds) if len(good) > 2 else ()))
 
 
-def _find_empty_masks(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[Issue]:
+def _find_empty_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> Iterator[Issue]:
+    """The cameras whose masks are empty although the hull of the other inputs is in their image."""
     assert frame.mask is not None
     share = (frame.mask > FOREGROUND).sum((1, 2)) / frame.cameras.size_px.prod(-1).to(frame.mask.device)
-    names = [name for name, covered in zip(frame.cameras.names, share.tolist(), strict=True) if covered == 0]
-    others = frame.without(names)
-    if not names or len(others.cameras) < 2 or others.mask is None:
+    share_of = dict(zip(frame.cameras.names, share.tolist(), strict=True))
+    empty = [name for name in frame.cameras.names if share_of[name] == 0]
+    others = frame.select([name for name in inputs if share_of[name] > 0])
+    if not empty or len(others.cameras) < 2 or others.mask is None:
         return
     try:
         proxy = reconstruct(others.mask, others.cameras, bounds)
     except ValueError:  # the calibration is wrong too, so that masks cannot be judged by it
         return
-    enough = EMPTY_SHARE * float(share[share > 0].median())
-    for name in names:
+    enough = EMPTY_SHARE * float(torch.tensor([share_of[name] for name in others.cameras.names]).median())
+    for name in empty:
         camera = frame.cameras.select([name])
         covered = float((proxy.depth(camera) > 0).sum() / camera.size_px.prod())
-        if covered >= enough:
+        if covered < enough:
+            continue
+        if name in inputs:
             expected = f"the subject should cover {100 * covered:.1f} % of the image"
             text = f"camera '{name}': its mask is empty, but {expected}, so it is left out; segment it again"
             yield Issue(text, camera=name)
+        else:
+            expected = "the other cameras see the subject"
+            effect = "scores against it are meaningless there"
+            yield Issue(f"camera '{name}': its mask is empty, but {expected}, so {effect}; segment it again")
 
 
 def _agreement(

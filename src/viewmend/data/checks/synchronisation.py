@@ -95,8 +95,15 @@ def find_desynchronised_camera(
     If the masks are in sync, looks for images that are out of sync with their own masks. With
     `fps`, frames per second, delays are stated in milliseconds too.
     """
+    now = frames[middle]
+    if now.mask is None:
+        return ()
+    # A camera whose mask is empty cannot be compared, and would leave the others without a hull
+    seeing = (now.mask > FOREGROUND).any(-1).any(-1).tolist()
     names = [
-        name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)
+        name
+        for name, sees in zip(now.cameras.names, seeing, strict=True)
+        if sees and all(name in frame.cameras.names for frame in frames)
     ]
     if len(names) < MIN_CAMERAS:
         return ()
