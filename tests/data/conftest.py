@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from reference.ball import photograph
+from reference.computed_once import carve_once
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.rigid import look_at
@@ -89,6 +90,12 @@ class PlainFolder:
         for frame in frames:
             writer.write(frame)
         writer.release()
+
+
+@pytest.fixture(autouse=True)
+def _carved_once(monkeypatch):
+    """Hulls of equal masks are carved once, not in each test: many tests change images alone."""
+    carve_once(monkeypatch)
 
 
 @pytest.fixture

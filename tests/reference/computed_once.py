@@ -1,6 +1,7 @@
 """Pure functions that are computed once for equal arguments, because many tests begin with the same scenes."""
 
 import hashlib
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from viewmend.data import prepare
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.proxy import reconstruct
 from viewmend.studio import procedural
 from viewmend.studio.performer import Performer
 from viewmend.studio.stage import Studio
@@ -20,6 +22,19 @@ from viewmend.types import MultiViewFrame
 
 CHECKS = ("diagnose", "shared_offset", "match_colours", "find_loose_masks")
 """The expensive functions of `viewmend.data.prepare`."""
+CARVERS = (
+    "frame_cache",
+    "geometry.alignment",
+    "data.colour_matching",
+    "data.checks.calibration",
+    "data.checks.colours",
+    "data.checks.diagnosis",
+    "data.checks.leave_one_out",
+    "data.checks.synchronisation",
+)
+"""The modules of the package in which many tests call `reconstruct` for the same masks."""
+MAX_HULLS = 64
+"""At most this many hulls are remembered; each takes up to three megabytes."""
 MAX_SCENES = 16
 """At most this many procedural scenes are remembered; each takes some megabytes."""
 MAX_DRAWN = 100
@@ -38,15 +53,18 @@ def content_of(value: Any) -> Any:
     return value
 
 
-def computed_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with a memory of its results, which must not be changed."""
-    results: dict[Any, Any] = {}
+def computed_once(function: Callable[..., Any], most: float = math.inf) -> Callable[..., Any]:
+    """The function with a memory of its last results, at most this many, which must not be changed."""
+    results: OrderedDict[Any, Any] = OrderedDict()
 
     @wraps(function)
     def remembered(*arguments: Any) -> Any:
         key = content_of(arguments)
         if key not in results:
             results[key] = function(*arguments)
+        results.move_to_end(key)
+        if len(results) > most:
+            results.popitem(last=False)
         return results[key]
 
     return remembered
@@ -84,7 +102,20 @@ def remembering_functions() -> dict[str, Callable[..., Any]]:
     return checks | dict.fromkeys(places, scene) | {"viewmend.studio.stage.Studio._draw": drawn_once()}
 
 
+@cache
+def remembering_hulls() -> Callable[..., Any]:
+    """`reconstruct`, with one memory for all tests of this process."""
+    return computed_once(reconstruct, MAX_HULLS)
+
+
+def carve_once(patch: pytest.MonkeyPatch) -> None:
+    """Let a test use the hulls that earlier ones carved of equal masks."""
+    for module in CARVERS:
+        patch.setattr(f"viewmend.{module}.reconstruct", remembering_hulls())
+
+
 def compute_once(patch: pytest.MonkeyPatch) -> None:
     """Let a test use what earlier ones computed of equal captures and scenes."""
+    carve_once(patch)
     for place, function in remembering_functions().items():
         patch.setattr(place, function)

@@ -14,3 +14,10 @@ def test_results_are_kept_for_equal_content_only():
     assert add(values, 1) == 7, "changed in place"
     assert add(values, 2) == 8
     assert len(given) == 3
+
+
+def test_the_oldest_result_is_forgotten_first():
+    given = []
+    double = computed_once(lambda value: given.append(value) or 2 * value, most=2)
+    assert [double(value) for value in (1, 2, 1, 3, 1, 2)] == [2, 4, 2, 6, 2, 4]
+    assert given == [1, 2, 3, 2], "2 was used longest ago when 3 came"
