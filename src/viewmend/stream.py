@@ -68,7 +68,7 @@ class StreamConfig:
     """How views are rendered, and which of their pixels are inpainted."""
     predict_mask: bool | None = None
     """Whether M_t is predicted where it is not known, as the alpha of the error model. None: if the
-    inpainter needs it, and there is an error model."""
+    inpainter needs it, and there is an error model. Views of reduced quality get no predicted mask."""
     background: Background = "black"
     """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 2000.0
@@ -553,5 +553,5 @@ class Stream:
 
 
 def _allows_mask(quality: RenderQuality) -> bool:
-    """Whether the quality allows the prediction of a mask, which takes as long as a view by `views`."""
-    return quality.mend and quality.context_times is None
+    """Whether the quality is not reduced, so that a mask is predicted: this takes as long as a view by `views`."""
+    return quality.mend and quality.context_times is None and quality.refine_fraction is None

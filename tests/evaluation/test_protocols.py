@@ -98,7 +98,14 @@ def test_a_model_that_needs_a_mask_gets_a_predicted_one():
     assert torch.equal(mended_view.rgb, view.rgb)
     given = stream.view(TARGET, target_mask=torch.ones_like(used)).completed.view
     assert (given.target_mask[given.mask > 0] == 1).all()
-    assert stream.view(TARGET, quality=RenderQuality(mend=False)).completed.view.target_mask is None
+    for quality in (
+        RenderQuality(mend=False),
+        RenderQuality(context_times=2),
+        RenderQuality(refine_fraction=0.5),
+    ):
+        assert stream.view(TARGET, quality=quality).completed.view.target_mask is None, (
+            "a mask costs too much"
+        )
     strict = Stream(NeedsMask(), StreamConfig(predict_mask=False), error_model=HalfTheSubject())
     strict.add_frame(frame)
     assert strict.view(TARGET).completed.view.target_mask is None

@@ -40,10 +40,11 @@ class Device:
     def frame(self, level: QualityLevel) -> FrameTimes:
         """Inpainting has a part that does not depend on resolution."""
         size = 0.3 + 0.7 * level.scale**2
-        context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
+        frames = 7 if level.context_times is None else level.context_times
+        context = 1 - self.context_share * (1 - frames / 7) if frames else 0.25
         context *= 1.0 if level.refine_fraction is None else 0.2 + 0.8 * level.refine_fraction
         by = 1 + self.noise * self.chance.uniform(-1, 1)
-        encoding = 0.2 * self.relative_cost * by if level.context_times else 0.0
+        encoding = 0.2 * self.relative_cost * by if frames else 0.0
         filling = 0.8 * self.relative_cost * size * context * by
         rendering = self.pixels * level.scale**2 * by
         return FrameTimes(
@@ -115,7 +116,7 @@ def test_one_slow_frame_changes_nothing():
 @pytest.mark.parametrize("ladder", [CONTEXT_LADDER, REFINE_LADDER])
 def test_a_ladder_grows_in_cost_up_to_full_quality(ladder):
     work = [level.relative_cost for level in ladder.levels]
-    assert work == sorted(set(work)) and ladder.levels[-1] == FULL == QualityLevel(1.0, 7, None)
+    assert work == sorted(set(work)) and ladder.levels[-1] == FULL == QualityLevel(1.0, None, None)
     assert work[0] < 0.1 and work[-1] == 1
     assert max(ladder.moving.relative_cost, ladder.still.relative_cost) < 0.5 and ladder.still.scale == 1
     assert Budget(100.0, ladder.levels).predict_ms(FULL) == 0

@@ -42,8 +42,8 @@ DEFAULT_S_PER_PX = 6e-6
 """Seconds per pixel at full quality before any measurement, as on a slow machine."""
 SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
 """Scales of the resolution, from the cheapest level up."""
-FULL = QualityLevel(scale=1.0, context_times=7, top_k=None)
-"""The highest level: everything that a model can do."""
+FULL = QualityLevel(scale=1.0, context_times=None, top_k=None)
+"""The highest level: everything that a model can do, as by default in `RenderQuality`."""
 CONTEXT_LADDER = Ladder(
     (
         *(QualityLevel(scale, 0, 256) for scale in SCALES),
@@ -58,12 +58,12 @@ CONTEXT_LADDER = Ladder(
 """The ladder of models that inpaint holes by attention to context, from less to more context."""
 REFINE_LADDER = Ladder(
     (
-        *(QualityLevel(scale, 7, None, 0.0) for scale in SCALES),
-        *(QualityLevel(1.0, 7, None, fraction) for fraction in (0.1, 0.25, 0.5)),
+        *(QualityLevel(scale, None, None, 0.0) for scale in SCALES),
+        *(QualityLevel(1.0, None, None, fraction) for fraction in (0.1, 0.25, 0.5)),
         FULL,
     ),
-    moving=QualityLevel(1.0, 7, None, 0.0),
-    still=QualityLevel(1.0, 7, None, 0.0),
+    moving=QualityLevel(1.0, None, None, 0.0),
+    still=QualityLevel(1.0, None, None, 0.0),
 )
 """The ladder of models that predict errors, from smaller to larger parts of the subject."""
 
@@ -111,7 +111,7 @@ class Budget:
         """The predicted time of a view at this level; 0 before the first frame."""
         stages = (self._geometry, self._pixels, self._inpainting, self._context)
         geometry, pixels, inpainting, context = (median(times or (0.0,)) for times in stages)
-        cost = level.relative_cost + (context if level.context_times else 0.0)
+        cost = level.relative_cost + (0.0 if level.context_times == 0 else context)
         return geometry + pixels * level.scale**2 + inpainting * cost
 
     def record(self, level: QualityLevel, times: FrameTimes) -> None:
@@ -122,7 +122,7 @@ class Budget:
         if times.inpainting > 0:  # 0 if the view had no holes
             inpainting = times.inpainting / level.relative_cost
             self._inpainting.append(inpainting)
-            if level.context_times:
+            if level.context_times != 0:
                 # Relative to inpainting, which every level measures, so that a level without
                 # context follows a device that has become slower.
                 self._context.append(times.context / inpainting)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+WINDOW_FRAMES = 7
+"""Number of frames in the temporal window of the paper's model."""
 COARSE_FILL_COST = 0.15
 """Cost of a fill without context, relative to the full level."""
 REFINE_FIXED = 0.1
@@ -20,8 +22,9 @@ class QualityLevel:
 
     scale: float
     """Factor of width and height."""
-    context_times: int
-    """Number of context frames, the latest first; 0: no camera image is encoded."""
+    context_times: int | None
+    """Number of context frames, the latest first; None for the whole temporal window. With 0 no camera
+    image is encoded."""
     top_k: int | None
     """Context tokens that survive pruning; None for the model's own number."""
     refine_fraction: float | None = None
@@ -39,7 +42,8 @@ class QualityLevel:
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
             return self.scale**2 * COARSE_FILL_COST
-        return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
+        times = WINDOW_FRAMES if self.context_times is None else self.context_times
+        return self.scale**2 * (0.4 + 0.4 * times / WINDOW_FRAMES + 0.2 * tokens)
 
 
 @dataclass(frozen=True)
