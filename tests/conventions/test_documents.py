@@ -19,12 +19,16 @@ BLOCK = re.compile(r"^ *``` *\{? *\.?(sh|python)\b.*?$(.*?)^ *```", re.MULTILINE
 HAS_RECIPES = ("train", "make-dataset")
 
 
+@cache
 def sources(path: Path) -> dict[str, str]:
     """The source of the functions, classes and methods of a file by name; those of one name, one after the other."""
-    found, text = dict[str, str](), path.read_text()
+    found = dict[str, str]()
+    text = path.read_text()
+    lines = text.splitlines()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found[node.name] = found.get(node.name, "") + (ast.get_source_segment(text, node) or "")
+            own = "\n".join(lines[node.lineno - 1 : node.end_lineno])
+            found[node.name] = f"{found.get(node.name, '')}\n{own}"
     return found
 
 
