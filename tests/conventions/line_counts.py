@@ -80,13 +80,14 @@ def count_file(source: str) -> Counter[str]:
     """Count the patterns in the source of a file."""
     tree = ast.parse(source)
     lines = [line for line in source.splitlines() if line.strip()]
-    functions = [node for node in ast.walk(tree) if isinstance(node, Function)]
+    nodes = [*ast.walk(tree)]
+    functions = [node for node in nodes if isinstance(node, Function)]
     return Counter(
         lines=len(lines),
-        parallel=sum(is_parallel(node) for node in ast.walk(tree)),
-        walruses=sum(isinstance(node, ast.NamedExpr) for node in ast.walk(tree)),
+        parallel=sum(is_parallel(node) for node in nodes),
+        walruses=sum(isinstance(node, ast.NamedExpr) for node in nodes),
         long_lines=sum(len(line) > MAX_COLUMNS for line in lines),
-        prepositions=sum(begins_with_preposition(text) for text in docstrings(tree)),
+        prepositions=sum(begins_with_preposition(text) for text in docstrings(nodes)),
         late_constants=int(has_late_constants(tree)),
         statements=sum(count_statements(node) > MAX_STATEMENTS for node in functions),
         locals=sum(len(local_names(node)) > MAX_LOCALS for node in functions),
@@ -102,9 +103,9 @@ def is_parallel(node: ast.AST) -> bool:
     )
 
 
-def docstrings(tree: ast.Module) -> Iterator[str]:
+def docstrings(nodes: list[ast.AST]) -> Iterator[str]:
     """The docstrings of modules, classes, functions, constants and fields."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.Module | ast.ClassDef | Function):
             continue
         for statement in node.body:

@@ -47,8 +47,9 @@ def definitions(module: str, tree: ast.Module) -> Iterator[Definition]:
 def mentions(tree: ast.AST) -> tuple[Counter[str], Counter[str], set[str]]:
     """How often each name and each attribute is read, and what is imported (`module:name`)."""
     names, attributes, imported = Counter[str](), Counter[str](), set[str]()
-    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = [*ast.walk(tree)]
+    prose = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             names[node.id] += 1
         elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
