@@ -122,15 +122,6 @@ class BestAgreement:
     peer_distance: Float[Tensor, "view"]
     """The smallest distance of the camera of `distance` from a third one."""
 
-    @property
-    def typical(self) -> Float[Tensor, "view"]:
-        """The distance that a good camera may have.
-
-        It is the median, or the distance of the camera that it agrees with best from a third one: where
-        that is larger, the surface that these cameras share explains it, which the hull may misplace.
-        """
-        return self.peer_distance.nan_to_num(0.0).maximum(self.distance.nanmedian())
-
 
 def best_agreement(colours: SurfaceColours) -> BestAgreement:
     """Compare each camera's colours with those of all others."""

@@ -59,22 +59,27 @@ class OtherSubjectRule:
     min_distance: float = 0.09
     """The distance is larger than this."""
     ratio: float = 2.5
-    """It is also larger than this many times the typical one; or the following three conditions hold."""
+    """It is also larger than this many times the median; or the following three conditions hold."""
     lower_ratio: float = 1.55
-    """The distance is larger than this many times the typical one."""
+    """The distance is larger than this many times the median."""
     max_correlation: float = 0.72
     """The best correlation with the others is below this share of the median."""
     min_cameras: int = 5
     """The rig has at least this many cameras: medians of fewer say little."""
+    peer_ratio: float = 1.5
+    """Either way, the distance is larger than this many times `BestAgreement.peer_distance`: where that is
+    large, the surface that these cameras share explains it, which the hull may misplace."""
 
     def applies(self, found: BestAgreement) -> Bool[Tensor, "view"]:
         """Find the images to which the rule applies, by how well they agree with the others."""
         distance = found.distance
-        farther = distance > self.lower_ratio * found.typical
+        typical = distance.nanmedian()
+        farther = distance > self.lower_ratio * typical
         unlike = found.correlation < self.max_correlation * found.correlation.nanmedian()
         is_large = len(distance) >= self.min_cameras
-        far = (distance > self.ratio * found.typical) | (farther & unlike & is_large)
-        return far & (distance > self.min_distance)
+        far = (distance > self.ratio * typical) | (farther & unlike & is_large)
+        explained = distance <= self.peer_ratio * found.peer_distance
+        return far & ~explained & (distance > self.min_distance)
 
 
 def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
@@ -106,7 +111,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
         elif bool(other_subject[view]):
             texts[view] = (
                 f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, "
-                f"typically by {100 * found.typical[view]:.0f} %); "
+                f"typically by {100 * distance.nanmedian():.0f} %); "
                 "check whether they are from another camera or frame, rotated, mirrored, BGR or of another exposure"
             )
         elif bool(blurred[view] | noisy[view]):
