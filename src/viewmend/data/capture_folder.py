@@ -190,12 +190,13 @@ class CaptureFolder:
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
             results = list(pool.map(lambda view: self._readers[view].read(time), views))
         self._warn_about_rotation()
-        images = {view: image for view, image in zip(views, results, strict=True) if image is not None}
-        if not images:
+        by_view = {view: images for view, images in zip(views, results, strict=True) if images is not None}
+        if not by_view:
             raise CaptureError(
                 f"{self.folder}: frame '{frame_id}': expected a readable frame in a video, got none; leave it out"
             )
-        frame = stack_images(list(images.values()), self.cameras[list(images)], time)
+        cameras = self.cameras[list(by_view)]
+        frame = stack_images(list(by_view.values()), cameras, time)
         if frame.mask is not None:
             frame = self._with_opaque_masks(frame)
         if frame.mask is not None and not frame.has_subject:  # only noise, such as that of a compressed video
@@ -206,7 +207,7 @@ class CaptureFolder:
         self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]
     ) -> UInt8[np.ndarray, "height width 3"]:
         """Undistort another image of this camera, such as a clean plate; ValueError for another camera or size."""
-        self.cameras.select([camera])
+        self.cameras.select([camera])  # raises the ValueError for an unknown name
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
     def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
@@ -385,8 +386,8 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     """Match the videos of a capture by time; None if it has no videos and no offsets.
 
     A camera's numbered images are matched like the frames of a video. Their rate is that of the capture or,
-    if it has none, of the first video. CaptureError if a video cannot be decoded, no two show the same
-    time, or there are offsets but no frame rate.
+    if it has none, of the first video. CaptureError if a video cannot be decoded, no two cameras
+    have frames of the same time, or there are offsets but no frame rate.
     """
     cameras = calibration.cameras
     videos: dict[tuple[str, str], Path] = {}

@@ -297,8 +297,9 @@ class ViewerConnection:
         now = self._now()
         self._send_new_rig()
 
-        # Compute the state, and send it if it is new, when its inputs have changed. Do so at every check if it
-        # may change without them: with extensions, or with a clock that plays behind the live edge.
+        # Compute the state when its inputs have changed, or when it has to be repeated. With extensions, or with a
+        # clock that plays behind the live edge, it may change at any time, so compute it at every check.
+        # `_send_state` sends it if it is new.
         plays_behind = self._service.source.span.live and session.clock.playing and not session.clock.live
         changes_by_itself = bool(self._registry.extensions) or plays_behind
         is_overdue = now - self._sent.state_s >= STATE_S
@@ -321,7 +322,8 @@ class ViewerConnection:
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(CloseCode.TIMEOUT, f"expected an ack within {ACK_S:g} s; reconnect"))
 
-        # An idle viewer needs nothing until its state is repeated; any other is due at every check.
+        # An idle viewer needs nothing until its state is repeated. Any other is due at every check, also one that
+        # `_send_statistics` has not yet sent the new number of viewers.
         gets_views = (
             session.wants_views or session.in_flight is not None or session.sent_since(now - RECENT_S)
         )
@@ -343,8 +345,9 @@ class ViewerConnection:
             viewer |= extension.state_json(self._session)
 
         # A page advances the clock of a recording by itself, but cannot know when a live rig's frames arrive.
-        computed_by_page = ("behind",) if source.span.live else ("time", "behind")
-        viewer_news = {key: value for key, value in viewer.items() if key not in computed_by_page}
+        # The distance to the live edge (`behind`) is sent along, but a change of it alone is not news.
+        no_news = ("behind",) if source.span.live else ("time", "behind")
+        viewer_news = {key: value for key, value in viewer.items() if key not in no_news}
         news = StateNews(inputs.shared.source, inputs.clock_changes, viewer_news)
         if news != self._sent.state or now - self._sent.state_s >= STATE_S:
             self._sent.state = news
@@ -370,8 +373,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
-        # A frame changes the statistics twice: when it is sent, and when it drops out of them a second later.
-        # So a frame that was sent less than a second before the last message changes them again.
+        # Statistics cover one second. A frame that the last message counted is now too old for them, so they
+        # have changed even if no frame was sent since.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -167,7 +167,8 @@ class RigFileSource(LiveSource):
             return read_images(camera, worker.counts, self._playback, worker.wait)
 
         def wants(taken_s: float, period_s: float) -> bool:
-            with self._cameras_lock:  # the aligner at this time: a changed rig gets a new one
+            # A changed rig gets a new aligner, so the attribute is read at each call
+            with self._cameras_lock:
                 return self._aligner.wants(taken_s, period_s)
 
         return CameraWorker(camera, connect, self._add_image, wants)

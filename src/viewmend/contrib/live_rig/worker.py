@@ -20,10 +20,11 @@ from viewmend.preprocess.masks.maker import MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
 
-FIRST_PAUSE_S = 0.1
-"""Attempts to connect begin at least this many seconds apart at first; the pause doubles each time."""
-MAX_PAUSE_S = 1.0
-"""The pause between the beginnings of attempts to connect grows to this many seconds."""
+FIRST_INTERVAL_S = 0.1
+"""The second attempt to connect begins at least this many seconds after the first; the interval doubles with
+each further attempt."""
+MAX_INTERVAL_S = 1.0
+"""The interval between attempts to connect grows to at most this many seconds."""
 POLL_S = 0.2
 """A thread that waits for images checks at this interval, in seconds, whether it has to end."""
 PERIOD_GAIN = 0.05
@@ -139,14 +140,14 @@ class CameraWorker:
 
     def read(self) -> None:
         """Read images, reconnecting after failures, until stopped."""
-        pause_s = FIRST_PAUSE_S
+        interval_s = FIRST_INTERVAL_S
         while not self._stopped.is_set():
             began_s = time.monotonic()
             try:
                 with contextlib.closing(self._connect(self)) as decoded_images:
                     for decoded in decoded_images:
                         if not self.up:
-                            pause_s = FIRST_PAUSE_S
+                            interval_s = FIRST_INTERVAL_S
                             self._note_connection()
                         self._receive(decoded)
                         if self._stopped.is_set():
@@ -155,9 +156,9 @@ class CameraWorker:
                     self._note_failure("there are no more images")
             except Exception as error:  # after any failure, the worker connects again
                 self._note_failure(str(error) or type(error).__name__)
-            if self.wait(began_s + pause_s - time.monotonic()):
+            if self.wait(began_s + interval_s - time.monotonic()):
                 return
-            pause_s = min(2 * pause_s, MAX_PAUSE_S)
+            interval_s = min(2 * interval_s, MAX_INTERVAL_S)
 
     def _note_connection(self) -> None:
         now_s = time.monotonic()

@@ -316,7 +316,7 @@ class ViewSynthNet(Network):
             completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
             return completed, state
 
-        # Otherwise, the whole subject is predicted, or a fraction of it at reduced quality
+        # Otherwise, `where` is predicted. At reduced quality, the view's E has selected a fraction of the subject
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
