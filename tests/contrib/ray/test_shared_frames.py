@@ -1,5 +1,6 @@
 """Frames are shared without copies: one process reads and carves, others render. Here in one process, but pickled."""
 
+import math
 import pickle
 import threading
 from dataclasses import replace
@@ -25,6 +26,8 @@ from viewmend.models.registry import make_method
 from viewmend.models.smooth_fill import SmoothFill
 
 FRAMES = 5
+INGESTS: list[Ingest] = []
+"""The ingests of the test that runs; their threads wait until the process ends."""
 MAX_PICKLE_BYTES = 20_000
 """For names, shapes and the like; the arrays have some hundred thousand bytes."""
 
@@ -109,7 +112,18 @@ def recording(frames=FRAMES, fps=None):
 
 
 def ingest_of(source, memory_mb=50.0, **options):
-    return Ingest(source, SmoothFill(), PIPELINE.hull, memory_mb, **options)
+    ingest = Ingest(source, SmoothFill(), PIPELINE.hull, memory_mb, **options)
+    INGESTS.append(ingest)
+    return ingest
+
+
+@pytest.fixture(autouse=True)
+def _idle_ingests():
+    """No frame is prepared after its test: a kernel that runs while Python ends would abort the process."""
+    yield
+    for ingest in INGESTS:
+        ingest._watched_at = -math.inf
+    INGESTS.clear()
 
 
 @pytest.fixture
