@@ -111,7 +111,7 @@ def test_the_command_publishes_a_range_of_a_capture(tmp_path, capsys):
     ]
     assert main(["publish", *arguments, "--frames", "1:3", "--title", "Two"]) == 0
     said = capsys.readouterr().err
-    assert "2 frames" in said and "python -m http.server" in said
+    assert "2 frames" in said and "images at full size" in said and "python -m http.server" in said
     assert json.loads((tmp_path / "out/scene.json").read_text())["frames"] == 2
     assert main(["publish", *arguments, "--max-mb", "0.1"]) == 2
     assert "raise --max-mb" in capsys.readouterr().err

@@ -111,9 +111,11 @@ def run(options: Options) -> int:
             config,
         )
         folder.publish(*RESULTS)
-    total = f"{made.frames} frames, {made.size_bytes / 1e6:.1f} MB"
+    total = f"{made.frames} frame{'s' if made.frames > 1 else ''}, {made.size_bytes / 1e6:.1f} MB"
     first = f"{made.first_bytes / 1e6:.1f} MB until the first frame is complete"
-    detail = f"images at {made.detail.image_scale:g} of their size, JPEG quality {made.detail.jpeg_quality}"
+    scale = made.detail.image_scale
+    size = "full size" if scale == 1 else f"{scale:g} of their size"
+    detail = f"images at {size}, JPEG quality {made.detail.jpeg_quality}"
     say(f"{options.out}: {total}, {first}; {detail}")
     say(f"look at it: python -m http.server --directory {options.out}, then open http://localhost:8000")
     return 0
