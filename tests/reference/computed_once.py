@@ -54,11 +54,16 @@ def content_of(value: Any) -> Any:
 
 
 def computed_once(function: Callable[..., Any], most: float = math.inf) -> Callable[..., Any]:
-    """The function with a memory of its last results, at most this many, which must not be changed."""
+    """The function with a memory of its last results, at most this many, which must not be changed.
+
+    Nothing is remembered for tensors of another class, such as those of an imitated device.
+    """
     results: OrderedDict[Any, Any] = OrderedDict()
 
     @wraps(function)
     def remembered(*arguments: Any) -> Any:
+        if any(isinstance(value, Tensor) and type(value) is not Tensor for value in arguments):
+            return function(*arguments)
         key = content_of(arguments)
         if key not in results:
             results[key] = function(*arguments)

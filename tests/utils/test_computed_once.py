@@ -21,3 +21,12 @@ def test_the_oldest_result_is_forgotten_first():
     double = computed_once(lambda value: given.append(value) or 2 * value, most=2)
     assert [double(value) for value in (1, 2, 1, 3, 1, 2)] == [2, 4, 2, 6, 2, 4]
     assert given == [1, 2, 3, 2], "2 was used longest ago when 3 came"
+
+
+def test_nothing_is_kept_for_tensors_of_another_class():
+    given = []
+    add = computed_once(lambda values: given.append(values))
+    parameter = torch.nn.Parameter(torch.ones(2))
+    add(parameter)
+    add(parameter)
+    assert len(given) == 2

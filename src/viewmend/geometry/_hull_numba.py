@@ -319,11 +319,12 @@ def bilinear(image, u, v):
 
 
 @kernel
-def summarise(values, faint, iso, block, blocks, inside, filled):
+def summarise(values, faint, iso, block, blocks, faint_blocks, inside, filled):
     """Mark what values of a grid lie above `faint` and `iso`, of which `faint` is lower.
 
     `filled` and `inside` are the planes across x, then y, then z with any value above `faint` and
-    `iso`; `blocks` are the cubes of `block` values along each side with any of at least `iso`.
+    `iso`; `blocks` are the cubes of `block` values along each side with any of at least `iso`, and
+    `faint_blocks` those with any above `faint`.
     """
     across_y = values.shape[0]
     across_z = across_y + values.shape[1]
@@ -332,6 +333,7 @@ def summarise(values, faint, iso, block, blocks, inside, filled):
             for z in range(values.shape[2]):
                 value = values[x, y, z]
                 if value > faint:
+                    faint_blocks[x // block, y // block, z // block] = True
                     filled[x] = True
                     filled[across_y + y] = True
                     filled[across_z + z] = True

@@ -75,6 +75,8 @@ class GridSummary:
 
     blocks: Bool[Tensor, "x_block y_block z_block"]
     """Blocks of `PART_BLOCK` voxels with any inside."""
+    faint_blocks: Bool[Tensor, "x_block y_block z_block"]
+    """Blocks with any voxel above `FAINT`."""
     inside: Box | None
     """The box of the voxels above `ISO`."""
     filled: Box | None
@@ -95,15 +97,15 @@ class OccupancyGrid:
     def summary(self) -> GridSummary:
         """The summary of the values, on the CPU; a device is read once."""
         if _has_kernels(self.values):
-            blocks, inside, filled = _summarise_cpu(self.values)
+            blocks, faint_blocks, inside, filled = _summarise_cpu(self.values)
         else:
-            in_blocks = any_in_blocks(self.values >= ISO)
+            in_blocks = any_in_blocks(torch.stack([self.values >= ISO, self.values > FAINT]))
             lines = sum(self.values.shape)
             parts = [in_blocks.flatten(), _lines(self.values > ISO), _lines(self.values > FAINT)]
             flat, inside, filled = torch.cat(parts).cpu().split([in_blocks.numel(), lines, lines])
-            blocks = flat.view(in_blocks.shape)
+            blocks, faint_blocks = flat.view(in_blocks.shape)
         shape = self.values.shape
-        return GridSummary(blocks, _box_of_lines(inside, shape), _box_of_lines(filled, shape))
+        return GridSummary(blocks, faint_blocks, _box_of_lines(inside, shape), _box_of_lines(filled, shape))
 
     @property
     def cubes(self) -> "Cubes":
@@ -207,27 +209,37 @@ def _box_of_lines(lines: Bool[Tensor, "line"], shape: Sequence[int]) -> Box | No
     return slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1), slice(z[0], z[-1] + 1)
 
 
-def any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_block z_block"]:
+def any_in_blocks(voxels: Bool[Tensor, "*grid x y z"]) -> Bool[Tensor, "*grid x_block y_block z_block"]:
     """Whether any voxel of each block of `PART_BLOCK` along each side is true."""
-    padded = pad(voxels, [end for side in reversed(voxels.shape) for end in (0, -side % PART_BLOCK)])
-    for axis in range(3):
-        padded = padded.unflatten(axis, (-1, PART_BLOCK)).any(axis + 1)
+    padded = pad(voxels, [end for side in reversed(voxels.shape[-3:]) for end in (0, -side % PART_BLOCK)])
+    for axis in (-3, -2, -1):
+        padded = padded.unflatten(axis, (-1, PART_BLOCK)).any(axis)
     return padded
 
 
 def _summarise_cpu(
     values: Float[Tensor, "x y z"],
-) -> tuple[Bool[Tensor, "x_block y_block z_block"], Bool[Tensor, "line"], Bool[Tensor, "line"]]:
-    """The blocks with any voxel inside, and the planes with any above `ISO` and `FAINT`, as in `_lines`."""
+) -> tuple[
+    Bool[Tensor, "x_block y_block z_block"],
+    Bool[Tensor, "x_block y_block z_block"],
+    Bool[Tensor, "line"],
+    Bool[Tensor, "line"],
+]:
+    """The blocks with any voxel inside, those with any above `FAINT`, and the planes with any above `ISO` and `FAINT`.
+
+    Planes are in the order of `_lines`.
+    """
     from viewmend.geometry._hull_numba import summarise
 
     blocks = torch.zeros([-(-side // PART_BLOCK) for side in values.shape], dtype=torch.bool)
+    faint_blocks = torch.zeros_like(blocks)
     inside = torch.zeros(sum(values.shape), dtype=torch.bool)
     filled = torch.zeros_like(inside)
     limits = (np.float32(FAINT), np.float32(ISO))  # torch, too, compares in single precision
     grid = values.detach().contiguous().numpy()
-    summarise(grid, *limits, PART_BLOCK, blocks.numpy(), inside.numpy(), filled.numpy())
-    return blocks, inside, filled
+    found = (blocks.numpy(), faint_blocks.numpy(), inside.numpy(), filled.numpy())
+    summarise(grid, *limits, PART_BLOCK, *found)
+    return blocks, faint_blocks, inside, filled
 
 
 def needed_views(views: int, config: HullConfig, cut_off: int = 0) -> int:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.geometry.hull import FAINT, ISO, PART_BLOCK, Box, OccupancyGrid, any_in_blocks, filled_sides
+from viewmend.geometry.hull import ISO, PART_BLOCK, Box, OccupancyGrid, filled_sides
 from viewmend.geometry.sampling import in_view
 
 CELL = 1.25
@@ -76,8 +76,7 @@ def filled_box(grid: OccupancyGrid) -> Box | None:
     ]
     if max(beyond) <= shell:
         return filled
-    faint_blocks = any_in_blocks(grid.values > FAINT).cpu()
-    labels, _ = label(faint_blocks.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels, _ = label(grid.summary.faint_blocks.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     connected = np.unique(labels[grid.summary.blocks.numpy()])
     of_blocks = filled_sides(torch.from_numpy(np.isin(labels, connected)))
     assert of_blocks is not None, "there are voxels inside"
