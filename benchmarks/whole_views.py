@@ -156,7 +156,7 @@ def judge(
 
 
 def depth_scores(view: IncompleteView, scene: StudioScene) -> dict[str, float]:
-    """Errors of the proxy's depth in a view: millimetres where the truth has depth too, and shares of the true surface.
+    """Errors of the proxy's depth in a view, in millimetres and as shares of the true surface.
 
     "extra" are pixels with depth where there is no surface.
     """

@@ -136,7 +136,7 @@ def best_agreement(colours: SurfaceColours) -> BestAgreement:
 def compare(
     own: Float[Tensor, "point 3"], shared: Bool[Tensor, "view point"], others: SurfaceColours, view: int
 ) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"]]:
-    """RMS distance of RGB and correlation of the colours `own` with each camera's, over the points that are shared.
+    """RMS distance of RGB, and correlation, of the colours `own` with each camera's, over shared points.
 
     NaN for the camera `view`, whose colours they are, and for cameras that share too few points.
     """

@@ -57,7 +57,7 @@ class Orientation:
 
 
 def orientation_of(value: int) -> Orientation | None:
-    """The orientation that a value of EXIF's tag means; None for 1, which is upright, and for invalid values."""
+    """The orientation that a value of EXIF's tag means; None for 1, upright, and for invalid values."""
     if not 2 <= value < 2 + len(EXIF_ORIENTATIONS):
         return None
     transposed, flip_rows, flip_columns = EXIF_ORIENTATIONS[value - 2]
@@ -65,7 +65,7 @@ def orientation_of(value: int) -> Orientation | None:
 
 
 def tiff_orientation(data: bytes) -> Orientation | None:
-    """How a TIFF file's first directory asks viewers to turn the image; None if it does not, or for other data."""
+    """How a TIFF file's first directory asks viewers to turn the image; None if it does not, or is none."""
     order = TIFF_ORDERS.get(data[:4])
     if order is None:
         return None
@@ -117,7 +117,7 @@ def _boxes(data: bytes) -> dict[bytes, bytes]:
 
 
 def exif_orientation(path: Path) -> Orientation | None:
-    """How EXIF, TIFF or AVIF asks viewers to turn the image; None if it does not, or if this is not an image."""
+    """How EXIF, TIFF or AVIF asks viewers to turn the image; None if it does not, or if it is not an image."""
     content = read_bytes(path)
     if content[:4] in TIFF_ORDERS:
         return tiff_orientation(content)

@@ -51,7 +51,7 @@ def sum_distances(slab, occupancy, P, size_px, low, depth, confidence, voxel_m, 
 
 @kernel
 def vote(slab, occupancy, sums, hull_weight, smooth_below, sharp_above, fused):
-    """Fill one slab of the fused occupancy from what `sum_distances` found, where the hull's occupancy is not 0.
+    """Fill one slab of the fused occupancy, from what `sum_distances` found in the hull.
 
     Sums of neighbours beyond the grid count as 0, as in the mean over all voxels of `_vote_torch`.
     """

@@ -143,7 +143,7 @@ def _vote_torch(
     """The fused occupancy, given the hull's occupancy and what the views say about each voxel."""
     _, weights, num_views = sums
 
-    # smooth where confidence is low, and where no view sees the voxel, so that no steps remain between the two
+    # smooth where confidence is low and, to leave no steps next to it, where no view sees the voxel
     mean_confidence = weights / num_views.clamp_min(1)
     sharp = (mean_confidence - config.smooth_below) / (config.sharp_above - config.smooth_below)
     weighted = sums[:2]

@@ -225,7 +225,7 @@ def _summarise_cpu(
     Bool[Tensor, "line"],
     Bool[Tensor, "line"],
 ]:
-    """The blocks with any voxel inside, those with any above `FAINT`, and the planes with any above `ISO` and `FAINT`.
+    """The blocks with any voxel inside, with any above `FAINT`, and the planes with any above `ISO`, `FAINT`.
 
     Planes are in the order of `_lines`.
     """

@@ -143,7 +143,7 @@ class Renderer:
         self.virtual_cameras: Cameras | None = None
         """The cameras around the subject whose views are completed ahead; None if none are."""
         self._fused: tuple[tuple[int, tuple[str, ...]], Stream] | None = None
-        """The frame of the last fused mesh and the cameras that it leaves out, with a stream that holds it alone."""
+        """Frame and left-out cameras of the last fused mesh, and a stream that holds this frame alone."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
         self.assets_version: str | None = None
