@@ -182,6 +182,22 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     assert float(first_weight(out)) == float(kept[0]), "a finished run stays as it is"
 
 
+def test_a_resumed_run_knows_the_score_of_its_last_steps(place, tmp_path, monkeypatch):
+    scores = iter(
+        [1.0, 1.0, 3.0, 2.0, 2.0]
+    )  # at the start, after step 2, at the end, then of the resumed run
+    monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": next(scores)})
+    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
+    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
+    run = RUN | {"steps": 3, "validate_every": 2, "ema": 0.0}
+    config = TrainConfig(name="finetune", objective=options, scenes=scenes, **run)
+    out = train(config, tmp_path / "run")
+    best = float(first_weight(out))
+    train(replace(config, steps=5), out)
+    assert [entry["step"] for entry in log_of(out)][-1] == 5
+    assert float(first_weight(out)) == best, "the weights of step 3 scored more than those of steps 4 and 5"
+
+
 def test_a_run_without_captures_holds_nothing_back(tmp_path):
     options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
     run = RUN | {"steps": 1, "validate_every": 1}

@@ -99,8 +99,8 @@ class CaptureFolder:
 
     Raises:
         CaptureError: `cameras.json` is invalid, or a camera name is unknown. A camera has no files in
-            any frame, or a frame has no camera. Only some cameras have masks or depth. A file lies
-            outside the folder.
+            any frame, or a frame has no camera. Only some cameras have depth, or only one has masks. A
+            file lies outside the folder.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class CaptureFolder:
 
     @property
     def gaps(self) -> tuple[tuple[str, str], ...]:
-        """Camera name and frame id of each missing image."""
+        """Camera name and frame id, for each frame in which a camera lacks one of its files."""
         missing = np.argwhere(~self.present)
         return tuple((self.cameras.names[camera], self.frame_ids[time]) for camera, time in missing)
 
@@ -211,7 +211,7 @@ class CaptureFolder:
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
     def _with_opaque_masks(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """The frame with opaque masks: those with class labels or low grey levels are converted to 0 and 255.
+        """The frame with its foreground at 255: masks with class labels or low grey levels are converted.
 
         A warning names the cameras; it is logged once for the same cameras.
         """
@@ -270,13 +270,13 @@ class CaptureFolder:
         present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
         for camera, row in zip(self._native_cameras, present, strict=True):
             if not row.any():
-                raise CaptureError(self._describe_unused_camera(camera, exists))
+                raise CaptureError(self._describe_camera_without_files(camera, exists))
         empty_frames = np.flatnonzero(~present.any(0)).tolist()
         if empty_frames:
             raise CaptureError(self._describe_empty_frame(empty_frames[0], exists))
         return present
 
-    def _describe_unused_camera(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
+    def _describe_camera_without_files(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
         """The error message for a camera that lacks a file in every frame."""
         kinds = camera.file_kinds
         absent: list[FileKind] = [
@@ -299,7 +299,7 @@ class CaptureFolder:
 
     def _describe_empty_frame(self, time: int, exists: Callable[[str], bool]) -> str:
         """The error message for a frame in which no camera has all of its files."""
-        # The kinds of files in the capture, and which of them all cameras lack in this frame
+        # The kinds of files in the capture, and those that no camera has in this frame
         readers = {kind: [r for r in self._readers if kind in r.camera.file_kinds] for kind in FILE_KINDS}
         kinds: list[FileKind] = [kind for kind in FILE_KINDS if readers[kind]]
         absent: list[FileKind] = [
@@ -318,7 +318,8 @@ class CaptureFolder:
         _, where = readers[example][0].locate(example, time)
 
         # The next step: a `cameras.json` lists its frames, in other formats a frame is a set of images
-        steps = ["add them, black ones if there is no subject" if absent == ["mask"] else "add them"]
+        only_masks = absent == ["mask"]
+        steps = ["add them, black ones if there is no subject"] if only_masks else ["add them"]
         if self._file.name == CALIBRATION and self.clock is None:
             steps.append(f"remove the frame from {self._file}")
         elif self._file.name != CALIBRATION and "image" in kinds and "image" not in absent:

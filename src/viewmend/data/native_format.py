@@ -189,7 +189,7 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
     """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
-    # Content that was made from another format passes through JSON, so that it is checked as a file's is
+    # Content made from another format is converted to JSON and back, so that it passes the same checks as a file
     as_read = read_json(json.dumps(content))
     checked = typed({"format": FORMAT, **as_read}, _Content)
     shift_px = 0.5 - np.array(checked.first_pixel_center)
@@ -211,7 +211,7 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
 def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
     """The rounded middle of the cameras; 0 if they are near enough to 0 for 32-bit numbers.
 
-    It is a multiple of the power of ten that is closest above the extent of the rig.
+    The middle is rounded to a multiple of the smallest power of ten that is at least the rig's extent.
     """
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
@@ -265,7 +265,7 @@ def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], unit_m: flo
 
 
 def _with_slashes(path: str | None) -> str | None:
-    """The path with `/` between its parts, where it may have the backslashes of Windows."""
+    """The path with `/` instead of Windows' backslashes."""
     return None if path is None else path.replace("\\", "/")
 
 

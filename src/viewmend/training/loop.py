@@ -67,8 +67,8 @@ def train(
         out: folder for all files.
         start: the model to start from, instead of the one that `config.start` names.
         report: called after each step in the first process.
-        stopped: called after each step in every process; once any returns True, the run
-            ends with a checkpoint.
+        stopped: called before each step and after the last, in every process; once any returns True,
+            the run ends with a checkpoint.
 
     Returns:
         `out`.
@@ -99,8 +99,8 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        # The files are recorded before they exist, and as changing during the run: if it is killed, the next
-        # run may replace them
+        # The files are recorded before they exist, and marked as changing, because a run that is killed cannot
+        # record them. The next run may then replace them
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)
@@ -173,7 +173,8 @@ def join_processes() -> Iterator[Processes]:
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
         yield Processes(rank, count, device)
-        # gloo's threads may still hold the last tensors, and abort a process that exits before the others.
+        # With gloo, a process that exits before the others can crash, because gloo's threads may still hold the
+        # last tensors. So all wait here.
         torch.distributed.barrier()
     finally:
         torch.distributed.destroy_process_group()
@@ -333,9 +334,14 @@ class Run:
                 self._save(step, clock)
             elif self.processes.first and not self.keeps_best:
                 self._write_model()  # the run was complete already, but its model may have been removed
-            # The last steps are validated, unless the loop has just done so.
-            if self.validation is not None and step > first and step % config.validate_every:
-                self._validate(log, step)
+            # The last steps are validated, unless the loop has just done so. If their weights are the best, the
+            # checkpoint needs their score.
+            if step > first and config.validate_every and step % config.validate_every:
+                if self.validation is not None:
+                    self._validate(log, step)
+                has_better_weights = float(self.keeps_best and self.state.best_step == step)
+                if self.processes.maximum(has_better_weights) == [1.0]:
+                    self._save(step, clock)
 
     def _make_validation(self) -> Validation | None:
         """What scores the model: the held-back views of captures if the run keeps the best weights.
@@ -355,7 +361,7 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Score and log the averaged weights; write them if they are the best of a run that keeps the best."""
+        """Score and log the averaged weights. If the run keeps the best weights, and these are, write them."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
@@ -443,7 +449,7 @@ class Run:
         }
 
     def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
-        """Raise a FloatingPointError if the loss is not finite, after saving its batch."""
+        """Raise a FloatingPointError if the loss is not finite, after saving the samples that it is of."""
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -454,7 +460,7 @@ class Run:
                 folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data)
             )
         raise FloatingPointError(
-            f"expected a finite loss, got {float(total)} at step {step}; inspect its batch in {folder}, or lower the "
+            f"expected a finite loss, got {float(total)} at step {step}; inspect its samples in {folder}, or lower the "
             "learning rate and resume from the last checkpoint"
         )
 

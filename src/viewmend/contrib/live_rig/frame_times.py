@@ -32,7 +32,8 @@ class ArrivalTimes:
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """Note that the reader has received a packet; `waited` is whether it had to wait for it.
 
-        A packet that was not waited for may have been in a queue, so its arrival time means little.
+        A packet that was not waited for may have been in a queue, so its arrival time means little. Arrival
+        times need no packets; `SenderTimes` overrides this.
         """
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
@@ -51,7 +52,7 @@ class SenderTimes(ArrivalTimes):
     """The sender's timestamps, converted to this machine's clock."""
 
     def __init__(self, lag_packets: int = 0) -> None:
-        """Set up; `lag_packets` is how many packets late FFmpeg returns each packet."""
+        """Set up; FFmpeg returns each packet only after it has received `lag_packets` more."""
         super().__init__()
         self._clock = SenderClock()
         self._lag_packets = lag_packets

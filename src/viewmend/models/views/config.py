@@ -8,7 +8,8 @@ from msgspec import Meta
 from viewmend.utils.untrusted_input import typed
 
 OFFSETS = (-0.012, 0.0, 0.008, 0.016, 0.026, 0.038, 0.053, 0.073, 0.1, 0.14, 0.19, 0.26, 0.36, 0.5)
-"""The depth hypotheses of a ray: z-depth behind the proxy, in subject sizes (`SceneScale.size_m`)."""
+"""The depth hypotheses of a ray: z-depth behind the proxy (negative: in front), in subject sizes
+(`SceneScale.size_m`)."""
 RAY_VIEWS = 4
 """A ray is sampled in this many of the source cameras: those near the viewer that see the proxy's surface."""
 NUM_FEATURES = 18

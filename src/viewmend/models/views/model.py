@@ -2,10 +2,10 @@
 
     source cameras -> ray samples -> aggregation -> depth distribution -> blending -> prediction
 
-At half the resolution, each cell of 2 x 2 pixels has one ray, with samples at fixed offsets behind
-the proxy (the surface of the visual hull). The source cameras that see a ray best are sampled there
-and aggregated. A U-Net over the view turns the samples into a distribution over depths, as networks
-on cost volumes do (MVSNet, ENeRF).
+At half the resolution, each cell of 2 x 2 pixels has one ray, with samples at fixed offsets, from just
+in front of the proxy (the surface of the visual hull) to well behind it. The source cameras that see
+a ray best are sampled there and aggregated. A U-Net over the view turns the samples into a
+distribution over depths, as networks on cost volumes do (MVSNet, ENeRF).
 
 At full resolution, the cameras are sampled again at the depth found, and their colours are blended.
 Blending softens the image, so detail is added in two frequency bands: the detail of the blended
@@ -308,7 +308,8 @@ class ViewSynthNet(Network):
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
-        # Without a pixel to predict, or without a camera, the view is at most attenuated
+        # Without a pixel to predict, or without a camera, nothing is predicted. Background that `view.fade` marks
+        # is still attenuated
         sources = None
         if bool(where.any()):
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
@@ -316,7 +317,8 @@ class ViewSynthNet(Network):
             completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
             return completed, state
 
-        # Otherwise, `where` is predicted. At reduced quality, the view's E has selected a fraction of the subject
+        # Otherwise, `where` is predicted. At reduced quality it covers only a fraction of the subject, because the
+        # view's E does
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
@@ -335,7 +337,10 @@ class ViewSynthNet(Network):
         predicted: Mask,
         image: ViewImage,
     ) -> DepthDistribution:
-        """Samples the cameras on the rays of all cells, and scores the samples by a U-Net over the view."""
+        """Samples the cameras on the rays of all cells, and scores the samples by a U-Net over the view.
+
+        `view` has depth on the rim, too.
+        """
         # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
         proxy_depth = nearest_depth(view.depth * predicted)
         cells = torch.nonzero(proxy_depth > 0)
