@@ -189,7 +189,8 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
     """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
-    # Content made from another format is converted to JSON and back, so that it passes the same checks as a file
+    # Content made from another format is converted to JSON and back, so that it passes the same checks as a
+    # file
     as_read = read_json(json.dumps(content))
     checked = typed({"format": FORMAT, **as_read}, _Content)
     shift_px = 0.5 - np.array(checked.first_pixel_center)

@@ -96,8 +96,8 @@ class SentMessages:
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     made_ahead: int = 0
-    """The value of `SharedState.made_ahead` when messages `completed` were last sent. While it stays the same,
-    there is nothing to announce."""
+    """The value of `SharedState.made_ahead` when messages `completed` were last sent. While it stays the
+    same, there is nothing to announce."""
     announced: dict[FrameKey, int] = field(default_factory=dict)
     """For each frame, the number of meshes and completed views that a message `completed` last announced. A
     frame is announced again only when this number has changed."""
@@ -253,7 +253,8 @@ class ViewerConnection:
                 )
             self._service.lock.notify_all()
 
-        # The page waits for its new clock, so send it now. Changes by other messages are sent at the next check.
+        # The page waits for its new clock, so send it now. Changes by other messages are sent at the next
+        # check.
         if isinstance(message, ClockChange):
             self.send_due(self._registry.shared_state())
         self._registry.check_soon(self)
@@ -308,7 +309,8 @@ class ViewerConnection:
             self._sent.state_inputs = inputs
             self._send_state(inputs)
 
-        # Send the message `show` if the serving program has set a new one. The rig, to which it refers, comes first.
+        # Send the message `show` if the serving program has set a new one. The rig, to which it refers,
+        # comes first.
         if self._sent.rig is not None and shared.show and shared.show is not self._sent.show:
             self._sent.show = shared.show
             self._send_soon(shared.show)
@@ -322,8 +324,8 @@ class ViewerConnection:
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(CloseCode.TIMEOUT, f"expected an ack within {ACK_S:g} s; reconnect"))
 
-        # An idle viewer needs nothing until its state is repeated. All others are checked every time. A viewer that
-        # has not yet been sent the new number of viewers is not idle.
+        # An idle viewer needs nothing until its state is repeated. All others are checked every time. A
+        # viewer that has not yet been sent the new number of viewers is not idle.
         gets_views = (
             session.wants_views or session.in_flight is not None or session.sent_since(now - RECENT_S)
         )
@@ -373,8 +375,9 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
         now = self._now()
-        # Statistics cover the last second. They change when a frame is sent, and also when a frame that the last
-        # message counted becomes older than a second. That frame was sent at most a second before the message.
+        # Statistics cover the last second. They change when a frame is sent, and also when a frame that the
+        # last message counted becomes older than a second. That frame was sent at most a second before the
+        # message.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -99,8 +99,8 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        # The files are recorded before they exist, and marked as changing, because a run that is killed cannot
-        # record them. The next run may then replace them
+        # The files are recorded before they exist, and marked as changing, because a run that is killed
+        # cannot record them. The next run may then replace them
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)
@@ -173,8 +173,8 @@ def join_processes() -> Iterator[Processes]:
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
         yield Processes(rank, count, device)
-        # With gloo, a process that exits before the others can crash, because gloo's threads may still hold the
-        # last tensors. So all wait here.
+        # With gloo, a process that exits before the others can crash, because gloo's threads may still hold
+        # the last tensors. So all wait here.
         torch.distributed.barrier()
     finally:
         torch.distributed.destroy_process_group()
@@ -334,8 +334,8 @@ class Run:
                 self._save(step, clock)
             elif self.processes.first and not self.keeps_best:
                 self._write_model()  # the run was complete already, but its model may have been removed
-            # The last steps are validated, unless the loop has just done so. If their weights are the best, the
-            # checkpoint needs their score.
+            # The last steps are validated, unless the loop has just done so. If their weights are the best,
+            # the checkpoint needs their score.
             if step > first and config.validate_every and step % config.validate_every:
                 if self.validation is not None:
                     self._validate(log, step)
@@ -361,7 +361,7 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Score and log the averaged weights. If the run keeps the best weights, and these are, write them."""
+        """Score and log the averaged weights; write them if they are the best so far, and the run keeps those."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first = log.first_validation() or scores
@@ -460,8 +460,8 @@ class Run:
                 folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data)
             )
         raise FloatingPointError(
-            f"expected a finite loss, got {float(total)} at step {step}; inspect its samples in {folder}, or lower the "
-            "learning rate and resume from the last checkpoint"
+            f"expected a finite loss, got {float(total)} at step {step}; inspect its samples in {folder}, or lower "
+            "the learning rate and resume from the last checkpoint"
         )
 
     def _make_streams(self) -> list[SampleReplay[object]]:

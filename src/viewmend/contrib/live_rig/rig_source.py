@@ -131,8 +131,8 @@ class RigFileSource(LiveSource):
         Raises:
             CaptureError: a clean plate or a recording cannot be used. The current rig stays as it is.
         """
-        # Workers of unchanged cameras are kept. Cameras hold arrays, for which == gives no single truth value, so
-        # their representations are compared.
+        # Workers of unchanged cameras are kept. Cameras hold arrays, for which == gives no single truth
+        # value, so their representations are compared.
         unchanged = {repr(camera) for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}

@@ -308,8 +308,8 @@ class ViewSynthNet(Network):
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
-        # Without a pixel to predict, or without a camera, nothing is predicted. Background that `view.fade` marks
-        # is still attenuated
+        # Without a pixel to predict, or without a camera, nothing is predicted. Background that `view.fade`
+        # marks is still attenuated
         sources = None
         if bool(where.any()):
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
@@ -317,8 +317,8 @@ class ViewSynthNet(Network):
             completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
             return completed, state
 
-        # Otherwise, `where` is predicted. At reduced quality it covers only a fraction of the subject, because the
-        # view's E does
+        # Otherwise, `where` is predicted. At reduced quality it covers only a fraction of the subject,
+        # because the view's E does
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
