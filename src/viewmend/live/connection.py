@@ -99,7 +99,7 @@ class SentMessages:
     """The value of `SharedState.made_ahead` when messages `completed` were last sent. While it stays the
     same, there is nothing to announce."""
     announced: dict[FrameKey, int] = field(default_factory=dict)
-    """For each frame, the number of meshes and completed views that a message `completed` last announced. A
+    """The number of meshes and completed views of each frame that a message `completed` last announced. A
     frame is announced again only when this number has changed."""
 
 
