@@ -85,6 +85,10 @@ BAD = {
     "a list": (write("cameras.json", b"[1, 2]"), [FILE, "expected an object", "[1, 2]"]),
     "no version": (without("format"), [FILE, "format", "got nothing"]),
     "other version": (whole(format="plain-capture/2"), [FILE, '"plain-capture/1"', 'got "plain-capture/2"']),
+    "typo of case": (
+        lambda plain: plain.edit(lambda d: d["cameras"][1].update(k=d["cameras"][1].pop("K"))),
+        [FILE, "the key 'K'", "rename"],
+    ),
     "typo": (whole(metre_per_unit=0.001), [FILE, "metre_per_unit", "'metres_per_unit'", "rename"]),
     "no frames": (without("frames"), [FILE, "frames", "expected a value", "got nothing"]),
     "empty frames": (whole(frames=[]), [FILE, "frames", "not empty"]),

@@ -53,7 +53,7 @@ def open_capture(
         path: the folder, or the file that stands for it, such as `cameras.json`.
         cameras: names of the cameras to use; all by default.
         format: name of the format; by default it is recognised.
-        masks: whether to use the capture's own mask files, the alpha channel of its images, or no masks.
+        masks: which masks to use: the capture's own files, the alpha channel of its images, or none.
 
     Raises:
         CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see
@@ -98,9 +98,9 @@ class CaptureFolder:
     those of `open_capture`, which logs `issues`.
 
     Raises:
-        CaptureError: `cameras.json` is invalid, or a camera name is unknown. A camera has no files in
-            any frame, or a frame has no camera. Only some cameras have depth, or only one has masks. A
-            file lies outside the folder.
+        CaptureError: one of these: `cameras.json` is invalid; a camera name is unknown; a camera lacks
+            one of its files in every frame, or all cameras do in some frame; only some cameras have depth;
+            only one camera has masks; a file lies outside the folder.
     """
 
     def __init__(
@@ -283,7 +283,7 @@ class CaptureFolder:
             kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
         ]
 
-        # The file that is missing in the first frame is named as an example
+        # A file of the first frame is named as an example; it is missing if `absent` is not empty
         if absent:
             example: FileKind = absent[0]
             wanted = f"the camera's {example} in at least one frame"
@@ -306,7 +306,7 @@ class CaptureFolder:
             kind for kind in kinds if all(reader.lacks(kind, time, exists) for reader in readers[kind])
         ]
 
-        # A missing file is named as an example
+        # A file is named as an example; it is missing if `absent` is not empty
         if absent:
             example: FileKind = absent[0]
             wanted = "this file or another camera's"
@@ -317,7 +317,7 @@ class CaptureFolder:
             got = "no camera that has all"
         _, where = readers[example][0].locate(example, time)
 
-        # The next step: a `cameras.json` lists its frames, in other formats a frame is a set of images
+        # A frame can be removed: from the list in `cameras.json`; in other formats, by removing its images
         only_masks = absent == ["mask"]
         steps = ["add them, black ones if there is no subject"] if only_masks else ["add them"]
         if self._file.name == CALIBRATION and self.clock is None:

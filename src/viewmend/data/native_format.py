@@ -210,9 +210,9 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
 
 
 def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
-    """The rounded middle of the cameras; 0 if they are near enough to 0 for 32-bit numbers.
+    """An origin near the cameras; 0 if that is near enough for 32-bit numbers, or they have no extent.
 
-    The middle is rounded to a multiple of the smallest power of ten that is at least the rig's extent.
+    It is their middle, rounded to a multiple of the smallest power of ten that is at least the rig's extent.
     """
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
@@ -220,8 +220,8 @@ def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray
     is_valid = extent_m > 0 and bool(np.isfinite(middle_m).all())
     if not is_valid or np.abs(middle_m).max() <= FAR * extent_m:
         return np.zeros(3)
-    unit_m = 10.0 ** np.ceil(np.log10(extent_m))
-    return np.rint(middle_m / unit_m) * unit_m
+    step_m = 10.0 ** np.ceil(np.log10(extent_m))
+    return np.rint(middle_m / step_m) * step_m
 
 
 def moved_to(calibration: NativeCalibration, origin_m: Float64[np.ndarray, "3"]) -> NativeCalibration:
@@ -273,7 +273,7 @@ def _with_slashes(path: str | None) -> str | None:
 def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
     """Write a `cameras.json` that reads back as this calibration.
 
-    Positions are written in the coordinates of `calibration.file`, and file paths as they are.
+    Positions are in the coordinates of `calibration.file`; file paths stay unchanged.
     """
     calibration = moved_to(calibration, np.zeros(3))
     content = {
@@ -326,11 +326,11 @@ def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:
 
     Other unknown keys are ignored.
     """
-    absent = [key.lower() for key in known if key not in entry]
+    absent = {key.lower(): key for key in known if key not in entry}
     for key in entry.keys() - set(known):
         close = difflib.get_close_matches(key.lower(), absent, n=1, cutoff=0.8)
         if close:
-            raise _invalid(key, f"the key '{close[0]}'", f"'{key}'", "rename the key")
+            raise _invalid(key, f"the key '{absent[close[0]]}'", f"'{key}'", "rename the key")
 
 
 def _check_names_differ(key: str, names: Sequence[str]) -> None:

@@ -348,8 +348,8 @@ class ViewerConnection:
 
         # A page advances the clock of a recording by itself, but cannot know when a live rig's frames arrive.
         # The distance to the live edge (`behind`) is sent along, but a change of it alone is not news.
-        no_news = ("behind",) if source.span.live else ("time", "behind")
-        viewer_news = {key: value for key, value in viewer.items() if key not in no_news}
+        ignored = ("behind",) if source.span.live else ("time", "behind")
+        viewer_news = {key: value for key, value in viewer.items() if key not in ignored}
         news = StateNews(inputs.shared.source, inputs.clock_changes, viewer_news)
         if news != self._sent.state or now - self._sent.state_s >= STATE_S:
             self._sent.state = news
@@ -373,11 +373,10 @@ class ViewerConnection:
         self._sent.announced = counts
 
     def _send_statistics(self, viewers: int) -> None:
-        """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
+        """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # Statistics cover the last second. They change when a frame is sent, and also when a frame that the
-        # last message counted becomes older than a second. That frame was sent at most a second before the
-        # message.
+        # Statistics cover the last second. They change when a frame is sent, and when one that the last
+        # message counted leaves that second. Both kinds of frames were sent after `stats_s - 1`.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -76,15 +76,15 @@ def train(
     Raises:
         RunError: `out` holds a run with another config, or a damaged one.
         ValueError: another run is writing there, or `out` holds files that no run wrote.
-        FloatingPointError: a loss is not finite (its batch was saved in `out`), or a weight is not
+        FloatingPointError: a loss is not finite (its samples were saved in `out`), or a weight is not
             finite (the last checkpoint was kept).
     """
     with join_processes() as processes:
-        claim = _claim(out) if processes.first else nullcontext()
+        claim = _claim(out) if processes.is_first else nullcontext()
         with claim:
             run = Run(config, out, start, processes)
             for progress in run.steps(stopped):
-                if report is not None and processes.first:
+                if report is not None and processes.is_first:
                     report(progress)
     return out
 
@@ -116,7 +116,7 @@ class Processes:
     device: torch.device
 
     @property
-    def first(self) -> bool:
+    def is_first(self) -> bool:
         """Whether this process writes files and reports."""
         return self.rank == 0
 
@@ -282,10 +282,10 @@ class Run:
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
         config = self.config
-        first = self.state.step
-        step = first
-        clock = RunClock(config, first, self.state.elapsed_s)
-        with Log(self.out, first, self.processes.first) as log:
+        first_step = self.state.step
+        step = first_step
+        clock = RunClock(config, first_step, self.state.elapsed_s)
+        with Log(self.out, first_step, self.processes.is_first) as log:
             # Score the starting weights if they may be the best, or are the baseline for later scores
             scores_start = self.keeps_best or self.objective.scores_training_views
             if step == 0 and self.validation is not None and scores_start:
@@ -332,15 +332,16 @@ class Run:
                 yield entry
             if step > self.state.step:
                 self._save(step, clock)
-            elif self.processes.first and not self.keeps_best:
+            elif self.processes.is_first and not self.keeps_best:
                 self._write_model()  # the run was complete already, but its model may have been removed
             # The last steps are validated, unless the loop has just done so. If their weights are the best,
             # the checkpoint needs their score.
-            if step > first and config.validate_every and step % config.validate_every:
+            if step > first_step and config.validate_every and step % config.validate_every:
                 if self.validation is not None:
                     self._validate(log, step)
                 has_better_weights = float(self.keeps_best and self.state.best_step == step)
-                if self.processes.maximum(has_better_weights) == [1.0]:
+                (any_has_better_weights,) = self.processes.maximum(has_better_weights)
+                if any_has_better_weights:
                     self._save(step, clock)
 
     def _make_validation(self) -> Validation | None:
@@ -348,7 +349,7 @@ class Run:
 
         None if nothing is scored in this process.
         """
-        if not self.config.validate_every or not self.processes.first:
+        if not self.config.validate_every or not self.processes.is_first:
             return None
         if self.keeps_best:
             scenes = self.config.scenes
@@ -364,9 +365,9 @@ class Run:
         """Score and log the averaged weights; write them if they are the best so far, and the run keeps those."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
-        first = log.first_validation() or scores
+        first_scores = log.first_validation() or scores
         if TRAINED_SCORE in scores:
-            scores |= {"overfit": memorised_gain(scores, first)}
+            scores |= {"overfit": memorised_gain(scores, first_scores)}
         log.add_validation(step, scores)
         self.last_scores = scores
         score = scores.get("score")
@@ -388,7 +389,7 @@ class Run:
     def _has_stopped_improving(self, step: int) -> bool:
         """Whether a run that keeps the best weights found no better ones in the last `PATIENCE` validations."""
         waited = step - self.state.best_step
-        return self.processes.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
+        return self.processes.is_first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """Update all weights once, by the mean gradient over the samples of all streams."""
@@ -427,7 +428,7 @@ class Run:
         return [batch[first : first + size] for first in range(0, len(batch), size)]
 
     def _add_gradients(self, step: int, samples: list[object], share: float) -> dict[str, float]:
-        """Add the gradients of these samples' loss times `share`; returns the terms of the loss, named as `LOSSES`."""
+        """Add `share` times the gradients of these samples' loss; returns its terms, named as `LOSSES`."""
         output = self.ddp_objective(samples)
         assert isinstance(output, StepOutput)
         total = output.total
@@ -449,7 +450,7 @@ class Run:
         }
 
     def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
-        """Raise a FloatingPointError if the loss is not finite, after saving the samples that it is of."""
+        """Raise a FloatingPointError if the loss of these samples is not finite, after saving them."""
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -493,7 +494,7 @@ class Run:
         """Write a checkpoint, and the averaged weights unless the run keeps the best ones."""
         positions = self.processes.gather([stream.position for stream in self.streams])
         self.state = replace(self.state, step=step, elapsed_s=clock.elapsed_s(), positions=positions)
-        if self.processes.first:
+        if self.processes.is_first:
             save_run(self.out, self.config, self.state, self._modules, self._optimizers)
             if not self.keeps_best:
                 self._write_model()
@@ -544,7 +545,7 @@ def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """The update rule of the averaged weights: each step moves them by 1 - decay towards the weights.
+    """The update rule of the averaged weights: each step moves them the share 1 - decay of the way to the weights.
 
     They move faster in the first steps, so that the initial weights do not stay in the average.
     """

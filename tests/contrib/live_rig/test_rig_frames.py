@@ -82,7 +82,27 @@ def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
         counts = supply.camera_counts()
         assert all(c["connects"] == 1 and c["up"] for c in counts.values()) and "c5" not in counts
         assert counts["c0"]["used"] >= 1000 > counts["c1"]["used"], "what was counted goes on, too"
+        supply._workers["c0"].counts["replaced"] += 2000
+        supply._aligner.counts["c0"]["replaced"] += 5000
+        assert supply.camera_counts()["c0"]["replaced"] >= 7000, "by the camera's thread, and by the rig's"
         assert supply.read(supply.span.first - 1) is not None and supply.span.first > 0, "of the other rig"
+
+
+def test_recordings_that_do_not_overlap_are_an_error_of_the_rig(rig, monkeypatch):
+    def apart(_):
+        raise ValueError("expected recordings that overlap in time, got none")
+
+    monkeypatch.setattr("viewmend.contrib.live_rig.frame_readers.match_tracks", apart)
+    with pytest.raises(CaptureError, match="overlap in time"):
+        RigFileSource(rig)
+
+
+def test_a_rig_says_that_it_waits_for_its_cameras(rig):
+    supply = RigFileSource(rig, align=False)
+    with reading(supply):
+        assert supply.status.error == "waiting for the cameras" or supply.status.state == "ready"
+        wait_until(lambda: supply.status.state == "ready")
+        assert supply.status.error is None
 
 
 def test_what_was_lost_since_the_last_line_is_said_and_no_more(rig, caplog, monkeypatch):

@@ -15,7 +15,7 @@ from reference.films import picture, set_matrix, write_film
 
 from viewmend.contrib.live_rig import frame_readers, frame_times
 from viewmend.contrib.live_rig.frame_readers import DamageFilter, Playback, read_images
-from viewmend.contrib.live_rig.frame_times import ArrivalTimes, DriverTimes, SenderTimes
+from viewmend.contrib.live_rig.frame_times import DriverTimes, ImageTimes, SenderTimes
 from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.sender_clock import SenderClock
 from viewmend.data.video_clock import Timecode, Track
@@ -161,7 +161,7 @@ def test_a_driver_that_keeps_the_kernels_time_is_believed(clock, monkeypatch):
 
 
 def test_a_picture_of_the_same_time_is_counted_once():
-    times, counts = ArrivalTimes(), Counter()
+    times, counts = ImageTimes(), Counter()
     assert [times.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [
         True,
         False,

@@ -1,6 +1,6 @@
 """Synchronisation: groups the cameras' images, which arrive in any order, by the time of their exposure.
 
-The rig shows a frame at each of its ticks, which are evenly spaced in time. Each camera contributes
+There is one frame per tick. Ticks are evenly spaced in time. Each camera contributes
 the image that was taken closest to the tick.
 """
 
@@ -58,7 +58,7 @@ class NearestTick:
 class Aligner:
     """Groups images by tick. One thread at a time may call it.
 
-    A group is complete when each camera has sent an image for its tick or a later one. Cameras that
+    A group is complete when each camera has sent an image for the group's tick or a later tick. Cameras that
     have been silent for `ABSENT_S` are not waited for.
     """
 

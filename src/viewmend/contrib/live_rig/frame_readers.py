@@ -42,7 +42,7 @@ SCHEME_OPTIONS = {
     "rtsp": {"rtsp_transport": "tcp"},
     "rtsps": {"rtsp_transport": "tcp"},
 }
-"""Additional options for addresses with these schemes: lost packets do not end the stream."""
+"""More options by scheme: RTSP over TCP loses no packets; with UDP, overruns do not end the stream."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Playback:
         self.length_s = length_s
         """The length of a lap. When the first recording ends, all of them start again."""
         self.shifts_s: dict[str, float] = {}
-        """A time of a recording plus its shift is a time on the timeline, in seconds. The timeline begins with
-        the earliest image of all recordings. A recording without a shift here begins with the timeline."""
+        """Seconds to add to the times of each recording, which gives times on the timeline. The timeline starts
+        at the earliest image of all recordings. A recording without a shift here starts at 0."""
 
     def synchronise(self, tracks: Sequence[Track]) -> str | None:
         """Put these recordings on the timeline, by timecodes if they all have matching ones, otherwise by timestamps.

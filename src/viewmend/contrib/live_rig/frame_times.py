@@ -22,8 +22,8 @@ UNTIMED_FORMATS = WITHOUT_TIMES | {"mpjpeg", "rawvideo", "image2pipe", "jpeg_pip
 """These formats of FFmpeg have no meaningful timestamps."""
 
 
-class ArrivalTimes:
-    """Arrival times: each image counts as taken when its packet arrives."""
+class ImageTimes:
+    """When images were taken. In this base class, that is when their packets arrive."""
 
     def __init__(self) -> None:
         self._last_pts: int | None = None
@@ -32,8 +32,8 @@ class ArrivalTimes:
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """Note that the reader has received a packet; `waited` is whether it had to wait for it.
 
-        A packet that was not waited for may have been in a queue, so its arrival time means little. Arrival
-        times need no packets; `SenderTimes` overrides this.
+        A packet that was not waited for may have been in a queue, so its arrival time means little. The
+        base class needs no packets; `SenderTimes` overrides this.
         """
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
@@ -48,7 +48,7 @@ class ArrivalTimes:
         return not is_repeated
 
 
-class SenderTimes(ArrivalTimes):
+class SenderTimes(ImageTimes):
     """The sender's timestamps, converted to this machine's clock."""
 
     def __init__(self, lag_packets: int = 0) -> None:
@@ -57,11 +57,11 @@ class SenderTimes(ArrivalTimes):
         self._clock = SenderClock()
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last packets, the oldest first; None for those that were not waited
-        for. FFmpeg lags, so the data of the newest packet arrived at the first of these times."""
+        """When the reader received the last `lag_packets + 1` packets; None for those it did not wait for. As
+        FFmpeg lags by `lag_packets`, the newest packet's data arrived at the first of these times."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
-        """See `ArrivalTimes.add_packet`."""
+        """See `ImageTimes.add_packet`."""
         self._arrivals_s.append(arrived_s if waited else None)
         if len(self._arrivals_s) <= self._lag_packets:
             return
@@ -70,7 +70,7 @@ class SenderTimes(ArrivalTimes):
             self._clock.add_packet(float(packet.dts * packet.time_base), data_arrived_s)
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """See `ArrivalTimes.taken_s`."""
+        """See `ImageTimes.taken_s`."""
         return None if frame.time is None else self._clock.to_local_s(frame.time)
 
 
@@ -78,7 +78,7 @@ class DriverTimes(SenderTimes):
     """The kernel's timestamps, which are on one of this machine's clocks if the driver is correct."""
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """See `ArrivalTimes.taken_s`; times on an unknown clock are converted like a sender's."""
+        """See `ImageTimes.taken_s`; times on an unknown clock are converted like a sender's."""
         if frame.time is not None:
             from_monotonic_s = frame.time
             from_wall_clock_s = frame.time - (time.time() - time.monotonic())
@@ -88,11 +88,11 @@ class DriverTimes(SenderTimes):
         return super().taken_s(frame, arrived_s)
 
 
-def frame_times(camera: LiveCamera, container: "InputContainer") -> ArrivalTimes:
+def frame_times(camera: LiveCamera, container: "InputContainer") -> ImageTimes:
     """Choose how to time a camera's images, by its setting `clock` and the stream's format."""
     formats = container.format.name.split(",")
     if camera.clock == "arrival" or (camera.clock == "auto" and set(formats) & UNTIMED_FORMATS):
-        return ArrivalTimes()
+        return ImageTimes()
     if camera.clock == "auto" and "v4l2" in formats:
         return DriverTimes()
     return SenderTimes(max(LAG_PACKETS.get(name, 0) for name in formats))

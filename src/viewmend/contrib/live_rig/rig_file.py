@@ -177,8 +177,8 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file():
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # If the recognised file is not `path` but has its suffix, it is another calibration. With another
-    # suffix, `path` is taken for a part of it.
+    # A recognised file other than `path`, with the same suffix, is another calibration. With another suffix,
+    # `path` is taken to belong to it.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

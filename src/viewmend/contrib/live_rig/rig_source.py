@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +16,12 @@ from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
 from viewmend.contrib.live_rig.worker import CameraWorker
 from viewmend.data.camera_images import CameraImages, stack_images
 from viewmend.data.capture_folder import pinhole_cameras
+from viewmend.data.errors import CaptureError
 from viewmend.data.prepare import PreparedCapture, prepare
 from viewmend.data.source import MemoryCapture
 from viewmend.data.video_clock import video_track
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.live.frame_source import SourceStatus
 from viewmend.live.push import LiveSource
 from viewmend.types import MultiViewFrame
 
@@ -76,7 +77,6 @@ class RigFileSource(LiveSource):
             CaptureError: the rig's file, its calibration, a clean plate or a recording cannot be used.
         """
         super().__init__(fps, memory_mb)
-        self.status = SourceStatus(error="waiting for the cameras")
         self._path = path
         self._max_image_size = max_image_size
         self._align = align
@@ -120,10 +120,12 @@ class RigFileSource(LiveSource):
     def camera_counts(self) -> dict[str, dict[str, int]]:
         """Event counts of each camera. The key "up" is 1 if the camera delivers images, else 0."""
         with self._cameras_lock:
-            return {
-                name: {"up": int(worker.up), **worker.counts, **self._aligner.counts[name]}
-                for name, worker in self._workers.items()
-            }
+            counts: dict[str, dict[str, int]] = {}
+            for name, worker in self._workers.items():
+                # The copy is made in one step, while the worker goes on counting
+                own = Counter(worker.counts)
+                counts[name] = {"up": int(worker.up), **(own + self._aligner.counts[name])}
+            return counts
 
     def _switch_to(self, rig: LiveRig) -> None:
         """Replace the current rig. Unchanged cameras continue; new ones are opened by `_begin_rig`.
@@ -142,7 +144,10 @@ class RigFileSource(LiveSource):
         recordings = [camera for camera in rig.cameras if camera.is_file]
         if recordings:
             tracks = [video_track(camera.name, "images", Path(camera.url)) for camera in recordings]
-            timecode_note = self._playback.synchronise(tracks)
+            try:
+                timecode_note = self._playback.synchronise(tracks)
+            except ValueError as error:
+                raise CaptureError(f"{rig.name}: {error}") from None
             if timecode_note is not None:
                 log.warning("%s", timecode_note)
 
@@ -182,6 +187,7 @@ class RigFileSource(LiveSource):
             bounds = Bounds(low, high)
         up = None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32)
         self.begin(rig.name, rig.fps, bounds, up)
+        self.status = replace(self.status, error="waiting for the cameras")
         for worker in self._new_workers:
             worker.start()
 
@@ -225,7 +231,7 @@ class RigFileSource(LiveSource):
         if self._prepared is None:
             self._prepared = self._prepare(frame)
         if self._prepared is None:
-            self.status = replace(self.status, error="the masks are empty: no subject is visible")
+            self.status = replace(self.status, error="fewer than two masks show a subject")
             return
         self.spread_ms = 1000 * group.spread_s
         self.add(self._prepared.adjust(frame, label="the newest frame"))

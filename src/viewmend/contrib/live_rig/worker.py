@@ -98,7 +98,7 @@ class CameraWorker:
         self.up = False
         """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why the camera delivers no images, or the last fault of an image since it connected; None without one."""
+        """Why no images are delivered, or the last fault of an image since connecting; None if neither."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
         self._connect = connect

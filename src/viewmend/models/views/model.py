@@ -297,8 +297,9 @@ class ViewSynthNet(Network):
 
         Pixels that `view.fade` marks as background are not predicted but attenuated. With a
         `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their
-        surroundings. Small changes from the viewer's last view, which is `state`, are partly undone
-        to reduce flicker (`steadying`).
+        surroundings. To reduce flicker, small differences from the viewer's last view (`state`) are
+        partly undone (`steadying`). Small operations run on one thread, which is faster; convolutions
+        use all.
         """
         fraction = context.quality.refine_fraction
         where = view.refine_mask & (rim_depth(view.depth) > 0)
@@ -317,8 +318,8 @@ class ViewSynthNet(Network):
             completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
             return completed, state
 
-        # Otherwise, `where` is predicted. At reduced quality it covers only a fraction of the subject,
-        # because the view's E does
+        # Otherwise, `where` is predicted. At reduced quality, E and hence `where` are already limited to a
+        # fraction of the subject
         reduced_quality = fraction is not None
         filled = self.fill_holes(view, sources, quick=reduced_quality)
         prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
@@ -358,7 +359,7 @@ class ViewSynthNet(Network):
         means = cell_means(image.stacked())
         cell_channels = concatenate_channels(means, relative[None], has_depth[None].to(means))
 
-        # Scores of the hypotheses: one from each sample alone, and one from its neighbourhood
+        # Score of each hypothesis: that of its sample alone, plus that of its neighbourhood
         with self.autocast():
             samples = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
