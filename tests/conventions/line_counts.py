@@ -4,6 +4,7 @@ import ast
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "viewmend"
@@ -76,9 +77,15 @@ SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
+@cache
+def parse(source: str) -> ast.Module:
+    """The syntax tree of a source, parsed once for all conventions; leave it as it is."""
+    return ast.parse(source)
+
+
 def count_file(source: str) -> Counter[str]:
     """Count the patterns in the source of a file."""
-    tree = ast.parse(source)
+    tree = parse(source)
     lines = [line for line in source.splitlines() if line.strip()]
     nodes = [*ast.walk(tree)]
     functions = [node for node in nodes if isinstance(node, Function)]
@@ -166,7 +173,7 @@ def count_folders(
     for path in sorted(root.rglob(f"*{suffix}")):
         relative = path.relative_to(root)
         folder = relative.parts[0] if len(relative.parts) > 1 else "top level"
-        counts.setdefault(folder, Counter()).update(count_file(path.read_text()))
+        counts.setdefault(folder, Counter()).update(count_file(path.read_text("utf-8")))
     return counts
 
 

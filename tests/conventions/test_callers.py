@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from conventions.line_counts import parse
+
 import viewmend
 
 SRC = Path(__file__).resolve().parents[2] / "src"
@@ -67,7 +69,7 @@ def mentions(tree: ast.AST) -> tuple[Counter[str], Counter[str], set[str]]:
 def unused(src: Path, public: set[str]) -> list[str]:
     """Public definitions that nothing in `src` mentions but themselves."""
     paths = {".".join(p.relative_to(src).with_suffix("").parts): p for p in sorted(src.rglob("*.py"))}
-    trees = {name.removesuffix(".__init__"): ast.parse(path.read_text()) for name, path in paths.items()}
+    trees = {name.removesuffix(".__init__"): parse(path.read_text("utf-8")) for name, path in paths.items()}
     read = {module: mentions(tree) for module, tree in trees.items()}
     attributes = sum((found for _, found, _ in read.values()), Counter[str]())
     imported = {i for module, (_, _, found) in read.items() for i in found if module != "viewmend"}

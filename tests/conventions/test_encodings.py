@@ -3,6 +3,8 @@
 import ast
 from pathlib import Path
 
+from conventions.line_counts import parse
+
 ROOT = Path(__file__).parents[2] / "src/viewmend"
 EXCEPTIONS = {"studio/bvh.py", "studio/procedural/skeleton.py"}
 """These read ASCII."""
@@ -13,7 +15,7 @@ def test_text_files_have_an_encoding():
         f"{name}:{node.lineno}"
         for path in ROOT.rglob("*.py")
         if (name := path.relative_to(ROOT).as_posix()) not in EXCEPTIONS
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        for node in ast.walk(parse(path.read_text("utf-8")))
         if isinstance(node, ast.Call) and has_no_encoding(node)
     }
     assert calls == set()
