@@ -67,12 +67,13 @@ def test_the_hull_follows_the_depth_that_is_predicted():
     target = camera_at(77, "novel", 96)
 
     def depth_m(model) -> float:
-        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), FusionConfig(view_px=96))
+        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), SMALL)
         return float(proxy.depth(target)[0, 48, 48])
 
     # Views from the side move the surface that faces the target by less than the full distance.
-    assert 0.008 < depth_m(Moved(0.02)) - depth_m(Moved(0.0)) < 0.02
-    assert 0.016 < depth_m(Moved(0.04)) - depth_m(Moved(0.0)) < 0.04
+    still_m = depth_m(Moved(0.0))
+    assert 0.008 < depth_m(Moved(0.02)) - still_m < 0.02
+    assert 0.016 < depth_m(Moved(0.04)) - still_m < 0.04
 
 
 def test_views_are_no_larger_than_asked_for_and_no_more():

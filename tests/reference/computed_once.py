@@ -13,8 +13,10 @@ import pytest
 from torch import Tensor
 
 from viewmend.data import prepare
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.proxy import reconstruct
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.studio import procedural
 from viewmend.studio.performer import Performer
 from viewmend.studio.stage import Studio
@@ -33,6 +35,10 @@ CARVERS = (
     "data.checks.synchronisation",
 )
 """The modules of the package in which many tests call `reconstruct` for the same masks."""
+SMALL_PX = 128
+"""Masks of at most this many pixels along their longer side are small: a subject spans fewer than 100."""
+SMALL_HULL = HullConfig(resolution=64)
+"""A hull for small masks, whose voxels are about as large as a pixel."""
 MAX_HULLS = 64
 """At most this many hulls are remembered; each takes up to three megabytes."""
 MAX_SCENES = 16
@@ -113,10 +119,20 @@ def remembering_hulls() -> Callable[..., Any]:
     return computed_once(reconstruct, MAX_HULLS)
 
 
-def carve_once(patch: pytest.MonkeyPatch) -> None:
+def carve_coarsely(
+    mask: Tensor, cameras: Cameras, bounds: Bounds | None = None, config: HullConfig | None = None
+) -> GeometryProxy:
+    """`reconstruct` with a memory; by default, hulls of small masks have `SMALL_HULL`."""
+    if config is None and max(mask.shape[1:]) <= SMALL_PX:
+        config = SMALL_HULL
+    return remembering_hulls()(mask, cameras, bounds, config)
+
+
+def carve_once(patch: pytest.MonkeyPatch, coarsely: bool = False) -> None:
     """Let a test use the hulls that earlier ones carved of equal masks."""
+    carve = carve_coarsely if coarsely else remembering_hulls()
     for module in CARVERS:
-        patch.setattr(f"viewmend.{module}.reconstruct", remembering_hulls())
+        patch.setattr(f"viewmend.{module}.reconstruct", carve)
 
 
 def compute_once(patch: pytest.MonkeyPatch) -> None:
