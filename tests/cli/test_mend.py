@@ -18,6 +18,8 @@ from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import open_masked, prepare
+from viewmend.fused_geometry import fuse_geometry
+from viewmend.geometry.fusion import FusionConfig
 from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.mending import Mender
 from viewmend.metrics.image_quality import psnr, ssim_map
@@ -266,7 +268,11 @@ def test_an_orbit_goes_around_the_subject_while_it_is_there(away, tmp_path, mend
     assert code == 0 and report["psnr_whole"] is None and "1 of 1 frames" in said
 
 
-def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend):
+def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend, monkeypatch):
+    small = FusionConfig(resolution=96, max_views=12, view_px=96)
+    monkeypatch.setattr(
+        "viewmend.stream.fuse_geometry", lambda *arguments: fuse_geometry(*arguments[:-1], small)
+    )
     reports = {}
     for geometry in ("hull", "fused"):
         options = ("--leave-out", "held", "--frames", "0:1", "--geometry", geometry)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from reference.capture_folder import edit_description
+from reference.computed_once import carve_coarsely
 from reference.filmed_board import photograph, waved
 
 from viewmend.cli import main
@@ -31,6 +32,11 @@ BENT = np.array([-0.06, 0.02, 0, 0, 0])
 NOISE = 2.0
 
 
+@pytest.fixture(autouse=True)
+def _carved_coarsely(monkeypatch):
+    monkeypatch.setattr(cross_validation, "reconstruct", carve_coarsely)
+
+
 def film(folder, cameras, board, count, yaw_rad=np.pi, bent=BENT, seed=0):
     """Each camera's images of a board that is carried through the stage, a folder each."""
     board, rng = parse_board(board, DICTIONARY), np.random.default_rng(seed)
@@ -40,7 +46,7 @@ def film(folder, cameras, board, count, yaw_rad=np.pi, bent=BENT, seed=0):
     for time, pose in enumerate(waved(count, size_m, seed, yaw_rad)):
         for view, name in enumerate(cameras.names):
             (folder / name).mkdir(parents=True, exist_ok=True)
-            image = photograph(board, K[view], bent, poses[view] @ pose, sizes[view])
+            image = photograph(board, K[view], bent, poses[view] @ pose, sizes[view], rays_per_side=2)
             image = np.full(sizes[view][::-1], 110, np.uint8) if image is None else image
             noisy = (0.85 * image + 10 + rng.normal(0, NOISE, image.shape)).clip(0, 255).astype(np.uint8)
             assert cv2.imwrite(str(folder / name / f"{time:03d}.png"), noisy)

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 RAYS = 3
-"""Rays to a pixel, along each side."""
+"""Rays to a pixel, along each side, unless fewer suffice."""
 
 
 def waved(count, size_m, seed=0, yaw_rad=np.pi, low=(-0.7, 0.25, -0.7), high=(0.7, 1.75, 0.7)):
@@ -25,7 +25,7 @@ def waved(count, size_m, seed=0, yaw_rad=np.pi, low=(-0.7, 0.25, -0.7), high=(0.
         yield pose
 
 
-def photograph(board, K, dist, camera_from_board, size_px, grey=110):
+def photograph(board, K, dist, camera_from_board, size_px, grey=110, rays_per_side=RAYS):
     """The board's picture; None from behind or where it is out of sight."""
     width_m, height_m = board.columns * board.square_m, board.rows * board.square_m
     rim = np.array([[x, y, 0] for x in (0, width_m) for y in (0, height_m)], float)
@@ -39,7 +39,12 @@ def photograph(board, K, dist, camera_from_board, size_px, grey=110):
     image = np.full((size_px[1], size_px[0]), grey, np.uint8)
     if (high - low).min() < 4:
         return None
-    fine = (np.mgrid[low[1] * RAYS : high[1] * RAYS, low[0] * RAYS : high[0] * RAYS] + 0.5) / RAYS
+    fine = (
+        np.mgrid[
+            low[1] * rays_per_side : high[1] * rays_per_side, low[0] * rays_per_side : high[0] * rays_per_side
+        ]
+        + 0.5
+    ) / rays_per_side
     rows, columns = fine.shape[1:]
     pixels = fine[::-1].reshape(2, -1).T
     if np.any(dist):
@@ -54,7 +59,9 @@ def photograph(board, K, dist, camera_from_board, size_px, grey=110):
     at = (hits @ camera_from_board[:3, :2] + board.square_m) * texels - 0.5
     at = at.astype(np.float32).reshape(rows, columns, 2)
     fine = cv2.remap(texture, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(grey,))
-    small = fine.reshape(rows // RAYS, RAYS, columns // RAYS, RAYS).mean((1, 3))
+    small = fine.reshape(rows // rays_per_side, rays_per_side, columns // rays_per_side, rays_per_side).mean(
+        (1, 3)
+    )
     image[low[1] : high[1], low[0] : high[0]] = np.rint(small)
     return image
 
