@@ -9,12 +9,13 @@ from reference.attention_reference import attend_reference, rotate_reference, tr
 
 from viewmend.models.paper import transformer
 from viewmend.models.paper.transformer import (
+    KeyMask,
     TokenPositions,
     Transformer,
     attend,
     attend_and_sum,
     attend_weighted,
-    rope_cos_sin,
+    rope_factors,
     rope_frequencies,
     rotate,
     straight_through,
@@ -44,22 +45,23 @@ def reference(Q, K, V, keep):
 def test_every_path_equals_the_reference(qkv, monkeypatch):
     Q, K, V, keep = qkv
     outs, sums = reference(Q, K, V, keep)
-    assert torch.allclose(attend(Q, K, V, keep, SCALE), outs, atol=1e-5)
+    assert torch.allclose(attend(Q, K, V, KeyMask.of(keep, Q.dtype), SCALE), outs, atol=1e-5)
     assert torch.allclose(attend_weighted(Q, K, V, keep.float(), SCALE), outs, atol=1e-5)
     for entries in (1 << 22, 2 * 3 * 7 * 2):
         monkeypatch.setattr(transformer, "CHUNK_ENTRIES", entries)
-        attended, received = attend_and_sum(Q, K, V, keep, ALL, SCALE)
+        attended, received = attend_and_sum(Q, K, V, KeyMask.of(keep, Q.dtype), ALL, SCALE)
         assert torch.allclose(attended, outs, atol=1e-5)
         assert torch.allclose(received, sums, atol=1e-5)
 
 
 def test_gradients_of_every_path_equal_the_reference(qkv):
     *inputs, keep = qkv
+    mask = KeyMask.of(keep, torch.float32)
     paths = [
         lambda *x: reference(*x, keep)[0],
-        lambda *x: attend(*x, keep, SCALE),
+        lambda *x: attend(*x, mask, SCALE),
         lambda *x: attend_weighted(*x, keep.float(), SCALE),
-        lambda *x: attend_and_sum(*x, keep, ALL, SCALE)[0],
+        lambda *x: attend_and_sum(*x, mask, ALL, SCALE)[0],
     ]
     gradients = []
     for path in paths:
@@ -72,16 +74,19 @@ def test_gradients_of_every_path_equal_the_reference(qkv):
 def test_attention_without_keys_is_zero(qkv):
     Q, K, V, keep = qkv
     keep = torch.zeros_like(keep)
-    assert not attend(Q, K, V, keep, SCALE).any()
+    assert not attend(Q, K, V, KeyMask.of(keep, Q.dtype), SCALE).any()
     assert not attend_weighted(Q, K, V, keep.float(), SCALE).any()
-    attended, received = attend_and_sum(Q, K, V, keep, ALL, SCALE)
+    attended, received = attend_and_sum(Q, K, V, KeyMask.of(keep, Q.dtype), ALL, SCALE)
     assert not attended.any() and not received.any()
 
 
 def test_rotation_equals_the_reference(rng):
-    x, angle = torch.randn(3, 8, generator=rng), torch.randn(3, 4, generator=rng)
+    x = torch.randn(3, 8, generator=rng)
+    at = torch.rand(3, 3, generator=rng)
+    frequencies = torch.randn(3, 4, generator=rng)
+    angle = at @ frequencies
     slow = torch.stack([rotate_reference(a, b) for a, b in zip(x, angle, strict=True)])
-    assert torch.allclose(rotate(x, torch.stack([angle.cos(), angle.sin()])), slow, atol=1e-6)
+    assert torch.allclose(rotate(x, rope_factors(at, frequencies)), slow, atol=1e-6)
 
 
 def test_rotated_scores_depend_on_position_differences_only(rng):
@@ -90,7 +95,7 @@ def test_rotated_scores_depend_on_position_differences_only(rng):
     at, there, shift = torch.rand(3, 50, 3, generator=rng) * 2 - 0.5
 
     def score(a, b):
-        return (rotate(q, rope_cos_sin(a, frequencies)) * rotate(k, rope_cos_sin(b, frequencies))).sum(-1)
+        return (rotate(q, rope_factors(a, frequencies)) * rotate(k, rope_factors(b, frequencies))).sum(-1)
 
     assert torch.allclose(score(at, there), score(at + shift, there + shift), atol=1e-3)
     assert not torch.allclose(score(at, there), score(at, there + shift), atol=1e-1)

@@ -26,6 +26,8 @@ WAITING = (
     "aten::masked_select",
     "aten::equal",
     "aten::is_nonzero",
+    "aten::unique_dim",
+    "aten::_unique2",
 )
 """The CPU waits for the device in these, because a result or its size is needed."""
 ALLOCATING = (
@@ -188,6 +190,18 @@ def other_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     def new_tensor(self, data, *, dtype=None, device=None):
         return make(data, dtype=dtype or self.dtype).to(device or self.device)
 
+    attend = torch.nn.functional.scaled_dot_product_attention
+
+    def fused_attention(*tensors, attn_mask=None, **options):
+        """The fused kernel, which a GPU has in float32, too; it aligns a mask first."""
+        if not isinstance(tensors[0], There):
+            return attend(*tensors, attn_mask=attn_mask, **options)
+        for _ in range(1 if attn_mask is None else 2):
+            _count_kernel("fused attention")
+        values = tree_map_only(There, lambda tensor: tensor.values, (tensors, attn_mask))
+        return There(attend(*values[0], attn_mask=values[1], **options))
+
+    monkeypatch.setattr(torch.nn.functional, "scaled_dot_product_attention", fused_attention)
     # These would make their tensor without an operator, and know no such device.
     monkeypatch.setattr(torch, "tensor", tensor)
     monkeypatch.setattr(Tensor, "new_tensor", new_tensor)

@@ -39,39 +39,52 @@ def rope_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
     return torch.block_diag(*(2 * math.pi / LONGEST * (LONGEST / SHORTEST) ** x for x in octaves)).float()
 
 
-def rope_cos_sin(
+def rope_factors(
     coordinates: Float[Tensor, "*batch 3"], frequencies: Float[Tensor, "3 pair"]
-) -> Float[Tensor, "2 *batch pair"]:
-    """Cosine and sine of the rotation angles at these (u, v, s)."""
+) -> Float[Tensor, "2 *batch channel"]:
+    """By what `rotate` multiplies each channel, and the other channel of its pair, at these (u, v, s)."""
     # A sum of products, not a matrix product: autocast would round the angles to bfloat16.
     angles = (coordinates[..., None] * frequencies).sum(-2)
-    return torch.stack([angles.cos(), angles.sin()])
+    cos = angles.cos()
+    sin = angles.sin()
+    return torch.stack([torch.cat([cos, cos], -1), torch.cat([-sin, sin], -1)])
 
 
 def rotate(
-    x: Float[Tensor, "*batch channel"], cos_sin: Float[Tensor, "2 *#batch channel/2"]
+    x: Float[Tensor, "*batch channel"], factors: Float[Tensor, "2 *#batch channel"]
 ) -> Float[Tensor, "*batch channel"]:
-    """RoPE(x): pairs (i, i + channel / 2) rotated by the angles of `rope_cos_sin`, in the precision of x."""
-    cos, sin = cos_sin.to(x.dtype)
-    first, second = x.chunk(2, -1)
-    return torch.cat([first * cos - second * sin, second * cos + first * sin], -1)
+    """RoPE(x): pairs of channels (i, i + channel / 2) rotated by `rope_factors`, which have the type of x."""
+    of_own, of_other = factors
+    return torch.addcmul(x * of_own, x.roll(x.shape[-1] // 2, -1), of_other)
 
 
-def attend(Q: Queries, K: Keys, V: Keys, keep: Bool[Tensor, "sample key"] | None, scale: float) -> Queries:
+@dataclass(frozen=True)
+class KeyMask:
+    """The keys that attention keeps."""
+
+    added: Float[Tensor, "sample 1 1 key"]
+    """Added to scores: 0 for a key to keep, -inf for others; 0 for all keys of a sample that keeps none."""
+    any_kept: Bool[Tensor, "sample 1 1 1"]
+
+    @classmethod
+    def of(cls, keep: Bool[Tensor, "sample key"], dtype: torch.dtype) -> "KeyMask":
+        """The mask of these keys, for scores of this type."""
+        any_kept = keep.any(1)[:, None, None, None]
+        added = torch.where(keep[:, None, None] | ~any_kept, 0.0, -torch.inf).to(dtype)
+        return cls(added, any_kept)
+
+
+def attend(Q: Queries, K: Keys, V: Keys, mask: KeyMask, scale: float) -> Queries:
     """softmax(Q K^T scale) V over the keys to keep, by the fused kernel; 0 for a sample that keeps none."""
-    if keep is None:
-        return F.scaled_dot_product_attention(Q, K, V, scale=scale)
-    any_kept = keep.any(1)
-    mask = (keep | ~any_kept[:, None])[:, None, None].expand(-1, -1, Q.shape[2], -1)
-    out = F.scaled_dot_product_attention(Q, K, V, attn_mask=mask, scale=scale)
-    return torch.where(any_kept[:, None, None, None], out, 0.0)
+    added = mask.added.expand(-1, -1, Q.shape[2], -1)
+    return F.scaled_dot_product_attention(Q, K, V, attn_mask=added, scale=scale) * mask.any_kept
 
 
 def attend_and_sum(
     Q: Queries,
     K: Keys,
     V: Keys,
-    keep: Bool[Tensor, "sample key"],
+    mask: KeyMask,
     counted: Bool[Tensor, "sample query"],
     scale: float,
 ) -> tuple[Queries, PerKey]:
@@ -81,13 +94,11 @@ def attend_and_sum(
     """
     samples, heads, queries, _ = Q.shape
     step = max(1, CHUNK_ENTRIES // (samples * heads * K.shape[2]))
-    any_kept = keep.any(1)[:, None, None, None]
-    mask = torch.where(keep[:, None, None] | ~any_kept, 0.0, -torch.inf).to(Q.dtype)
     outs = []
     received = Q.new_zeros(K.shape[0], K.shape[2], dtype=torch.float32)
     for start in range(0, queries, step):
-        scores = (Q[:, :, start : start + step] @ K.mT) * scale + mask
-        weights = scores.float().softmax(-1) * any_kept
+        scores = (Q[:, :, start : start + step] @ K.mT) * scale + mask.added
+        weights = scores.float().softmax(-1) * mask.any_kept
         outs.append(weights.to(V.dtype) @ V)
         received = received + (weights * counted[:, None, start : start + step, None]).sum((1, 2))
     return torch.cat(outs, 2), received
@@ -151,8 +162,8 @@ class Context:
 
     keys_values: KeysValues
     present: Bool[Tensor, "sample key"]
-    key_rotation: Float[Tensor, "2 sample 1 key pair"] | None
-    query_rotation: Float[Tensor, "2 sample 1 query pair"] | None
+    key_rotation: Float[Tensor, "2 sample 1 key channel"] | None
+    query_rotation: Float[Tensor, "2 sample 1 query channel"] | None
 
 
 class Transformer(nn.Module):
@@ -183,7 +194,8 @@ class Transformer(nn.Module):
         """The input tokens P after all blocks; each group prunes its context to `top_k` tokens, None for no pruning."""
         rotations = [None, None]
         if self.config.rope:
-            rotations = [rope_cos_sin(x.uvs, self.frequencies)[:, :, None] for x in (context_at, at)]
+            factors = [rope_factors(x.uvs, self.frequencies) for x in (context_at, at)]
+            rotations = [own[:, :, None].to(keys_values.dtype) for own in factors]
         context = Context(keys_values, context_at.present, *rotations)
         for group in range(self.config.groups):
             tokens = self.run_group(group, tokens, at.present, context, top_k)
@@ -198,6 +210,8 @@ class Transformer(nn.Module):
         top_k: int | None,
     ) -> Tokens:
         """The input tokens after one group. Attention of the counted tokens decides what its first block prunes."""
+        present = context.present
+        mask = KeyMask.of(present, context.keys_values.dtype)
         kept: Tensor | None = None
         weight: Tensor | None = None
         for number in range(self.config.blocks):
@@ -205,34 +219,33 @@ class Transformer(nn.Module):
             index = group * self.config.blocks + number
             block = self.blocks[index]
             assert isinstance(block, Block)
-            Q, K, V, present = self.project(index, tokens, context, kept)
+            Q, K, V = self.project(index, tokens, context, kept)
             if number == 0 and self.config.blocks > 1 and top_k is not None and top_k < K.shape[2]:
-                attended, received = attend_and_sum(Q, K, V, present, counted, self.scale)
+                attended, received = attend_and_sum(Q, K, V, mask, counted, self.scale)
                 if torch.is_grad_enabled():
                     weight = straight_through(received, present, top_k)
                 else:
                     kept = most_attended(received.masked_fill(~present, -1.0), top_k)
+                    mask = KeyMask.of(present.gather(1, kept), K.dtype)
             elif weight is not None:
                 attended = attend_weighted(Q, K, V, weight.to(Q.dtype), self.scale)
             else:
-                attended = attend(Q, K, V, present, self.scale)
+                attended = attend(Q, K, V, mask, self.scale)
             tokens = tokens + rearrange(attended, "b h n c -> b n (h c)")
             tokens = tokens + block.ffn(block.norm_ffn(tokens))
         return tokens
 
     def project(
         self, index: int, tokens: Tokens, context: Context, kept: Int[Tensor, "sample kept"] | None = None
-    ) -> tuple[Queries, Keys, Keys, Bool[Tensor, "sample key"]]:
-        """RoPE(Q), RoPE(K) and V of a block, and which keys count; of the kept keys alone, if given."""
+    ) -> tuple[Queries, Keys, Keys]:
+        """RoPE(Q), RoPE(K) and V of a block; of the kept keys alone, if given."""
         block = self.blocks[index]
         heads = self.config.heads
         assert isinstance(block, Block)
         Q = rearrange(block.query(block.norm_query(tokens)), "b n (h c) -> b h n c", h=heads)
         KV = rearrange(context.keys_values[index], "two b n (h c) -> two b h n c", h=heads)
-        present = context.present
         rotation = context.key_rotation
         if kept is not None:
-            present = present.gather(1, kept)
             pick = kept[:, None, :, None]
             KV = KV.gather(3, pick.expand(2, -1, heads, -1, KV.shape[4]))
             if rotation is not None:
@@ -241,4 +254,4 @@ class Transformer(nn.Module):
         if rotation is not None and context.query_rotation is not None:
             Q = rotate(Q, context.query_rotation)
             K = rotate(K, rotation)
-        return Q, K, V, present
+        return Q, K, V
