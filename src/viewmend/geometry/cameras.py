@@ -8,6 +8,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.geometry.rigid import invert_rigid
 from viewmend.utils.tensors import OnDevice, check_tensor
@@ -151,6 +152,12 @@ class Cameras(OnDevice):
         """Camera centres in world coordinates, metres."""
         return self.world_from_camera[:, :3, 3]
 
+    @cached_property
+    def projection(self) -> Float[Tensor, "view 3 4"]:
+        """K [R | t] in double precision: (u z, v z, z) of homogeneous world points; computed on the CPU."""
+        host = self.on_host
+        return (host.K.double() @ host.camera_from_world[:, :3].double()).to(self.K.device)
+
     @property
     def max_size_px(self) -> tuple[int, int]:
         """Width and height that hold every view."""
@@ -230,7 +237,7 @@ def project(
     P = cameras.K @ cameras.camera_from_world[:, :3]
     homogeneous = torch.einsum("vij,pj->vpi", P[:, :, :3], points_world) + P[:, None, :, 3]
     z = homogeneous[..., 2]
-    safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    safe = z.masked_fill(z.abs() < 1e-9, 1e-9)
     return homogeneous[..., :2] / safe[..., None], z
 
 
@@ -238,8 +245,7 @@ def unproject(
     uv_px: Float[Tensor, "view point 2"], z_m: Float[Tensor, "view point"], cameras: Cameras
 ) -> Float[Tensor, "view point 3"]:
     """World points at these pixels and z-depths, each in its own camera; inverse of `project`."""
-    ones = torch.ones_like(uv_px[..., :1])
-    rays = torch.einsum("vij,vpj->vpi", cameras.camera_from_pixel, torch.cat([uv_px, ones], -1))
+    rays = torch.einsum("vij,vpj->vpi", cameras.camera_from_pixel, F.pad(uv_px, (0, 1), value=1.0))
     world = cameras.world_from_camera
     return torch.einsum("vij,vpj->vpi", world[:, :3, :3], rays * z_m[..., None]) + world[:, None, :3, 3]
 
@@ -248,8 +254,8 @@ def pixel_centers(
     width: int, height: int, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "height width 2"]:
     """Image coordinates of every pixel's centre: (0.5, 0.5) at the top left."""
-    u = torch.arange(width, device=device, dtype=torch.float32) + 0.5
-    v = torch.arange(height, device=device, dtype=torch.float32) + 0.5
+    u = torch.arange(0.5, width, device=device)
+    v = torch.arange(0.5, height, device=device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, pixel_centers
 from viewmend.geometry.mesh import Mesh
@@ -20,6 +21,13 @@ BANDS = 4
 
 CANDIDATES = 1 << 22
 """The rasteriser in torch tests at most this many pixels at once, which bounds its memory."""
+
+EMPTY = -1
+"""The rasteriser in torch gives this key to pixels without a surface."""
+FACE_BITS = 0x7FFFFFFF
+"""These bits of a key hold the index of its face, subtracted from `LAST_FACE`."""
+LAST_FACE = FACE_BITS - 1
+"""Indices of faces are at most this, so that those of `EMPTY` mean -1."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
     views = len(cameras)
     vertices = mesh.vertices.detach().numpy()
     faces = mesh.faces.numpy()
-    P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).detach().numpy()
+    P = cameras.projection.detach().numpy()
     size = cameras.size_px.tolist()
     projected = torch.empty(views, len(vertices), 5, dtype=torch.float64).numpy()
     raster = Raster(
@@ -83,28 +91,28 @@ def interpolate(
     attributes: Float[Tensor, "vertex channel"], mesh: Mesh, cameras: Cameras, raster: Raster
 ) -> Float[Tensor, "view height width channel"]:
     """Vertex attributes at every pixel of `raster`, perspective-correct; zeros where there is no surface."""
-    image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
     if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
-        return _interpolate_cpu(attributes, mesh, cameras, raster, image)
+        return _interpolate_cpu(attributes, mesh, cameras, raster)
+    views, height, width = raster.triangle.shape
     if not len(mesh.faces):
-        return image
+        return attributes.new_zeros(views, height, width, attributes.shape[1])
     # all pixels, those without a surface with any triangle: to find the others would wait for the device
     covered = raster.triangle >= 0
     corners = mesh.faces[raster.triangle.clamp(min=0).long()].long()
-    view = torch.arange(len(cameras), device=image.device)[:, None, None, None]
-    edges, _ = edge_functions(homogeneous(mesh.vertices, cameras)[view, corners])
-    u, v = pixel_centers(image.shape[2], image.shape[1], image.device).double()[..., None, :].unbind(-1)
-    values = edges[..., 0] * u + edges[..., 1] * v + edges[..., 2]
-    total = torch.where(covered, values.sum(-1), 1.0)[..., None]
-    weights = (values / total).to(mesh.vertices)
-    colour = (attributes[corners] * weights[..., None].to(attributes)).sum(-2)
-    return torch.where(covered[..., None], colour, 0.0)
+    view = torch.arange(views, device=corners.device)[:, None, None, None]
+    edges = edge_functions(homogeneous(mesh.vertices, cameras)[view, corners])
+    uv1 = F.pad(pixel_centers(width, height, corners.device), (0, 1), value=1.0).double()
+    values = (edges @ uv1[..., None])[..., 0]
+    total = values.sum(-1, keepdim=True).masked_fill(~covered[..., None], 1.0)
+    weights = (values / total).to(attributes)
+    return (weights[..., None, :] @ attributes[corners])[..., 0, :] * covered[..., None]
 
 
-def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
+def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster):
     from viewmend.geometry._rasterize_numba import interpolate_band
 
-    P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
+    image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
+    P = cameras.projection.numpy()
     given = (attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy())
     triangles = raster.triangle.numpy()
     images = image.numpy()
@@ -122,17 +130,13 @@ def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, i
 
 def homogeneous(vertices: Float[Tensor, "vertex 3"], cameras: Cameras) -> Float[Tensor, "view vertex 3"]:
     """P X of every vertex in every camera, in float64: (u z, v z, z) with u, v in pixels."""
-    P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
+    P = cameras.projection
     return torch.einsum("vij,nj->vni", P[:, :, :3], vertices.double()) + P[:, None, :, 3]
 
 
-def edge_functions(
-    corners: Float[Tensor, "*batch 3 3"],
-) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
-    """Edge i as the plane q_j x q_k over (u, v, 1), and the triangle's determinant; corner by corner in dim -2."""
-    a, b, c = corners.unbind(-2)
-    edges = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
-    return edges, (a * edges[..., 0, :]).sum(-1)
+def edge_functions(corners: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Edge i of each triangle as the plane q_j x q_k over (u, v, 1); corner by corner in dim -2."""
+    return torch.linalg.cross(corners.roll(-1, -2), corners.roll(-2, -2))
 
 
 def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
@@ -141,42 +145,41 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
     """
     width, height = cameras.max_size_px
-    device = mesh.vertices.device
     corners = homogeneous(mesh.vertices, cameras)[:, mesh.faces.long()]
-    edges, determinant = edge_functions(corners)
+    edges = edge_functions(corners)
+    determinant = (corners[..., 0, :] * edges[..., 0, :]).sum(-1)
     low, high = _pixel_boxes(corners, cameras.size_px)
-    keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
+    keep = (low <= high).all(-1)
+    if cull:
+        keep = keep & (determinant * cull <= 0)
 
     # Every triangle of every view has a box of pixels. Only the total number of pixels is read from
-    # the device.
-    view = torch.arange(len(cameras), device=device).repeat_interleave(
-        len(mesh.faces), output_size=keep.numel()
-    )
-    face = torch.arange(len(mesh.faces), device=device).repeat(len(cameras))
-    extent = torch.where(keep[..., None], high - low + 1, 0).flatten(0, 1)
+    # the device. Edges become weights of the corners, which are 1/z at the corners' own pixels.
     low = low.flatten(0, 1)
-    edges = edges.flatten(0, 1)
-    determinant = determinant.flatten()
-    ends = extent.prod(-1).cumsum(0)
+    extent = ((high - low.view_as(high) + 1) * keep[..., None]).flatten(0, 1)
+    weights = (edges / determinant[..., None, None]).flatten(0, 1)
+    area = extent.prod(-1)
+    ends = area.cumsum(0)
 
     # The key orders by 1/z, then by the lower id: positive floats order like their bits.
-    keys = torch.full((len(cameras) * height * width,), -1, dtype=torch.long, device=device)
+    keys = torch.full((len(cameras) * height * width,), EMPTY, dtype=torch.long, device=ends.device)
     for part, pixels in _portions(ends):
-        owner, uv = _candidate_pixels(low[part], extent[part], pixels)
-        inverse = _inverse_depth(edges[part][owner], determinant[part][owner], uv)
-        owner = owner + part.start
-        key = (inverse.view(torch.int32).long() << 32) | (0x7FFFFFFF - face[owner])
-        key = torch.where(inverse > 0, key, -1)
-        keys.scatter_reduce_(0, (view[owner] * height + uv[:, 1]) * width + uv[:, 0], key, "amax")
+        box, uv = _candidate_pixels(low[part], extent[part], area[part], pixels)
+        inverse, visible = _inverse_depth(weights[part][box], uv)
+        triangle = box + part.start
+        view = triangle // len(mesh.faces)
+        key = (inverse.view(torch.int32).long() << 32) | (LAST_FACE - triangle % len(mesh.faces))
+        pixel = (view * height + uv[:, 1]) * width + uv[:, 0]
+        keys.scatter_reduce_(0, pixel, key.masked_fill(~visible, EMPTY), "amax")
 
     return _unpack_keys(keys.view(len(cameras), height, width))
 
 
 def _unpack_keys(keys: Int[Tensor, "view height width"]) -> Raster:
-    """Depth and triangle of each pixel from its key; -1 is the key of an empty pixel."""
-    triangle = torch.where(keys >= 0, 0x7FFFFFFF - (keys & 0x7FFFFFFF), -1).int()
+    """Depth and triangle of each pixel from its key. `EMPTY` becomes triangle -1, and its upper half is NaN."""
+    triangle = (LAST_FACE - (keys & FACE_BITS)).int()
     inverse = (keys >> 32).int().view(torch.float32)
-    return Raster(torch.where(keys >= 0, 1 / inverse, 0.0), triangle)
+    return Raster(inverse.reciprocal().nan_to_num(0.0), triangle)
 
 
 def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
@@ -205,35 +208,37 @@ def _pixel_boxes(
     corners: Float[Tensor, "view face 3 3"], size_px: Int[Tensor, "view 2"]
 ) -> tuple[Int[Tensor, "view face 2"], Int[Tensor, "view face 2"]]:
     """First and last pixel whose centre may be in each triangle; the whole image for one that crosses z = near."""
-    z = corners[..., 2:]
+    in_front = (corners[..., 2] > NEAR_M).sum(-1)[..., None]
+    crossing = in_front < 3
+    uv = corners[..., :2] / corners[..., 2:].clamp_min(NEAR_M)
+    first, last = uv.aminmax(dim=2)
     image_end = size_px[:, None].double() - 1
-    uv = corners[..., :2] / torch.where(z > NEAR_M, z, torch.inf)
-    behind = z <= NEAR_M
-    crossing = behind.any(2) & ~behind.all(2)
-    low = torch.where(crossing, 0, uv.amin(2) - 0.5).ceil().clamp(min=0).minimum(image_end + 1)
-    high = torch.where(crossing, image_end, uv.amax(2) - 0.5).floor().clamp(min=-1).minimum(image_end)
-    return low.long(), torch.where(behind.all(2), -1, high).long()
+    low = (first - 0.5).ceil().clamp_min(0)
+    high = (last - 0.5).floor().minimum(image_end)
+    low = low.masked_fill(crossing, 0)
+    high = torch.where(crossing, image_end, high).masked_fill(in_front == 0, -1)
+    return low.long(), high.long()
 
 
 def _candidate_pixels(
-    low: Int[Tensor, "face 2"], extent: Int[Tensor, "face 2"], pixels: int
+    low: Int[Tensor, "box 2"], extent: Int[Tensor, "box 2"], area: Int[Tensor, "box"], pixels: int
 ) -> tuple[Int[Tensor, "candidate"], Int[Tensor, "candidate 2"]]:
-    """Every pixel of every box, with the position of its box; there are `pixels` of them."""
-    area = extent.prod(-1)
-    owner = torch.repeat_interleave(torch.arange(len(area), device=area.device), area, output_size=pixels)
-    within = torch.arange(len(owner), device=area.device) - (area.cumsum(0) - area)[owner]
-    columns = extent[owner, 0]
-    return owner, low[owner] + torch.stack([within % columns, within // columns], -1)
+    """Every pixel of every box, with the index of its box; there are `pixels` of them."""
+    box = torch.repeat_interleave(area, output_size=pixels)
+    first = area.cumsum(0) - area
+    within = torch.arange(pixels, device=area.device) - first[box]
+    columns = extent[box, 0]
+    return box, low[box] + torch.stack([within % columns, within // columns], -1)
 
 
 def _inverse_depth(
-    edges: Float[Tensor, "candidate 3 3"],
-    determinant: Float[Tensor, "candidate"],
-    uv: Int[Tensor, "candidate 2"],
-) -> Float[Tensor, "candidate"]:
-    """1/z of the triangle at each pixel's centre, float32; -1 where the centre is outside it or z <= near."""
-    u, v = (uv.double() + 0.5).unsqueeze(1).unbind(-1)
-    value = edges[..., 0] * u + (edges[..., 1] * v + edges[..., 2])
-    inside = (value * determinant.sign()[:, None] >= 0).all(-1)
-    inverse = (value.sum(-1) / determinant).float()
-    return torch.where(inside & (inverse * NEAR_M < 1) & (inverse > 0), inverse, -1.0)
+    weights: Float[Tensor, "candidate 3 3"], uv: Int[Tensor, "candidate 2"]
+) -> tuple[Float[Tensor, "candidate"], Bool[Tensor, "candidate"]]:
+    """1/z of the triangle at each pixel's centre, float32, and whether the centre is inside it and z > near.
+
+    `weights` are the triangle's edges, divided by its determinant; not finite for one without an area.
+    """
+    u, v = (uv + 0.5).unsqueeze(1).unbind(-1)
+    value = weights[..., 0] * u + (weights[..., 1] * v + weights[..., 2])
+    inverse = value.sum(-1).float()
+    return inverse, (value >= 0).all(-1) & (inverse > 0) & (inverse * NEAR_M < 1)

@@ -14,13 +14,11 @@ class BilinearTaps(NamedTuple):
     """The four pixels that bilinear samples at many positions are made of."""
 
     row: Int[Tensor, "tap=4 view point"]
-    """Clamped to the image."""
+    """That of the nearest pixel at the border, if the image has no such pixel."""
     column: Int[Tensor, "tap=4 view point"]
-    """Clamped to the image."""
+    """As `row`."""
     weight: Float[Tensor, "tap=4 view point"]
     """The four weights sum to 1, also beyond the border of the image."""
-    inside: Bool[Tensor, "tap=4 view point"]
-    """Whether the image has this pixel; where not, `row` and `column` name the nearest one at its border."""
 
 
 def in_view(
@@ -43,9 +41,8 @@ def bilinear_taps(uv_px: Float[Tensor, "view point 2"], cameras: Cameras) -> Bil
     corner = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], device=uv_px.device)[:, None, None]
     place = first.long() + corner
     weight = torch.where(corner > 0, share, 1 - share).prod(-1)
-    inside = ((place >= 0) & (place < size)).all(-1)
     column, row = place.clamp(min=0).minimum(size - 1).unbind(-1)
-    return BilinearTaps(row, column, weight, inside)
+    return BilinearTaps(row, column, weight)
 
 
 def sample_bilinear(

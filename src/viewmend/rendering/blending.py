@@ -96,7 +96,6 @@ def _blend_cpu(
     # the novel view's rays, and the cameras' projections
     pose = camera.world_from_camera[0].double()
     world_from_pixel = pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())
-    P = rig.K.double() @ rig.camera_from_world[:, :3].double()
     mask = torch.zeros(0, 0, 0, dtype=torch.uint8) if frame.mask is None else frame.mask
     inputs = (
         depth.numpy(),
@@ -106,7 +105,7 @@ def _blend_cpu(
         frame.rgb.numpy(),
         mask.numpy(),
         sources.depth.numpy(),
-        P.numpy(),
+        rig.projection.numpy(),
         rig.centers.double().numpy(),
         rig.K[:, 0, 0].double().numpy(),
         rig.size_px.numpy(),

@@ -413,8 +413,7 @@ def project_lines(
     rays: Rays, cameras: Cameras
 ) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
     """Rays in homogeneous image coordinates of every camera: their step per metre of z-depth, and their start."""
-    cameras = _on_host(cameras)
-    P = cameras.K.double() @ cameras.camera_from_world[:, :3].double()
+    P = _on_host(cameras).projection
     linear = P[:, :, :3]
     start = linear @ rays.origin + P[:, :, 3]
     directions = rays.directions
