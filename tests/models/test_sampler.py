@@ -233,7 +233,8 @@ def test_rays_are_sampled_in_their_own_cameras_only(scene, kernels, cubic):
     seen = found.features[..., IN_VIEW].amax(2)
     torch.testing.assert_close(found.prior.sum(2), seen, atol=1e-3, rtol=0)
     parts = [sample(part, sources, 2.0, cubic) for part in replace(rays, cameras=chosen).split(700)]
-    assert torch.equal(torch.cat([part.features for part in parts]), found.features)
+    together = torch.cat([part.features for part in parts])
+    torch.testing.assert_close(together, found.features, atol=0 if kernels else 1e-6, rtol=0)
 
 
 def test_a_camera_that_does_not_exist_sees_nothing(scene):

@@ -31,6 +31,8 @@ from viewmend.models.views.pyramids import (
     SourceCameras,
     choose_levels,
     pixel_footprints,
+    source_images,
+    view_masks,
 )
 from viewmend.models.views.ray_fill import gather_ray_inputs
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
@@ -205,6 +207,11 @@ class PackedSources(SourceCameras):
         return cls(views, (), Silhouettes(inputs.masks, Cameras((), *tensors)), (), inputs.is_source)
 
     @property
+    def images(self) -> UInt8[Tensor, "view 5 height width"]:
+        """`SourceCameras.images`, of the inputs."""
+        return source_images(self.views.frame.rgb, view_masks(self.views), self.views.depth)
+
+    @property
     def mask_sums(self) -> tuple[Int[Tensor, "view"], Int[Tensor, "silhouette"]]:
         """`SourceCameras.mask_sums`, of the inputs."""
         return self.images[:, 3].sum((1, 2)), self.silhouettes.mask.sum((1, 2))
@@ -272,10 +279,11 @@ class PackedPyramids(NamedTuple):
     def at(self, levels: Int[Tensor, "level camera"]) -> MipLevels:
         """Several levels of each camera."""
         level = levels[:, None, None]
+        columns = self.columns[level]
         first = self.first[level] + torch.arange(levels.shape[1]) * self.pixels.shape[1]
-        return MipLevels(
-            self.pixels.flatten(0, 1), first, self.columns[level], self.size[level], 0.5 ** level.double()
-        )
+        first_two = torch.stack([first, first + columns], -1)
+        last = self.size[level].flip(-1) - 1
+        return MipLevels(self.pixels.flatten(0, 1), first_two, columns, last, 0.5 ** level.double())
 
 
 def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -68,12 +68,12 @@ class MipLevels(NamedTuple):
 
     pixels: Shaped[Tensor, "pixel channel"]
     """0 to 255, or metres."""
-    first: Int[Tensor, "*level view"]
-    """Index of each image's first pixel."""
+    first: Int[Tensor, "*level view 2"]
+    """Indices of the first pixels of each image's first two rows."""
     columns: Int[Tensor, "*level view"]
     """Pixels from one row to the next."""
-    size: Int[Tensor, "*level view 2"]
-    """Rows and columns of each image, with the border."""
+    last: Int[Tensor, "*level view 2"]
+    """Column and row of each image's last pixel, which is in its border."""
     scale: Float[Tensor, "*level view"]
     """Factor from positions in the camera's image to positions in this one."""
 
@@ -83,24 +83,46 @@ class MipLevels(NamedTuple):
         images = [
             pyramid.levels[level] for own in levels for pyramid, level in zip(pyramids, own, strict=True)
         ]
-        device = images[0].device
-        shape = (len(levels), 1, 1, len(pyramids))
-        size = torch.tensor([image.shape[:2] for image in images])
-        count = size.prod(1)
-        first_and_size = torch.cat([(count.cumsum(0) - count)[None], size.T]).view(3, *shape).to(device)
-        scale = torch.tensor([0.5**level for own in levels for level in own], dtype=torch.double)
-        return cls(
-            pixels=torch.cat([image.flatten(0, 1) for image in images]),
-            first=first_and_size[0],
-            columns=first_and_size[2],
-            size=first_and_size[1:].movedim(0, -1),
-            scale=scale.view(shape).to(device),
-        )
+        pixels = torch.cat([image.flatten(0, 1) for image in images])
+        sizes = [image.shape[:2] for image in images]
+        return cls._of_rows(pixels, sizes, [0.5**level for own in levels for level in own], len(levels))
+
+    @classmethod
+    def scaled(
+        cls, images: Sequence[Shaped[Tensor, "view channel _rows _columns"]], scales: Sequence[float]
+    ) -> "MipLevels":
+        """The images of all views at several scales, which get their borders; one of `scales` for each level."""
+        bordered = [F.pad(level.movedim(1, 3), (0, 0, 1, 1, 1, 1)) for level in images]
+        pixels = torch.cat([level.flatten(0, 2) for level in bordered])
+        sizes = [image.shape[:2] for level in bordered for image in level]
+        of_each = [scale for level, scale in zip(images, scales, strict=True) for _ in level]
+        return cls._of_rows(pixels, sizes, of_each, len(images))
+
+    @classmethod
+    def _of_rows(
+        cls,
+        pixels: Shaped[Tensor, "pixel channel"],
+        sizes: Sequence[Sequence[int]],
+        scales: Sequence[float],
+        levels: int,
+    ) -> "MipLevels":
+        """Rows of pixels of images of these sizes (rows and columns with the border), level by level.
+
+        What describes them is computed on the CPU, and copied to a device at once.
+        """
+        rows, columns = torch.tensor([list(size) for size in sizes]).unbind(1)
+        count = rows * columns
+        first = count.cumsum(0) - count
+        shape = (levels, 1, 1, len(sizes) // levels)
+        layout = torch.stack([first, first + columns, columns, columns - 1, rows - 1], 1)
+        layout = layout.view(*shape, 5).to(pixels.device)
+        scale = torch.tensor(scales, dtype=torch.double).view(shape).to(pixels.device)
+        return cls(pixels, layout[..., :2], layout[..., 2], layout[..., 3:], scale)
 
     def at(self, level: int) -> "MipLevels":
         """One of the levels."""
         return MipLevels(
-            self.pixels, self.first[level], self.columns[level], self.size[level], self.scale[level]
+            self.pixels, self.first[level], self.columns[level], self.last[level], self.scale[level]
         )
 
     @classmethod
@@ -110,19 +132,20 @@ class MipLevels(NamedTuple):
         rows, columns = bordered.shape[2:]
         # len(images) would make the number of cameras of an exported model constant.
         view = torch.arange(images.shape[0], device=images.device)
+        first = view * (rows * columns)
         return cls(
             pixels=bordered.movedim(1, 3).flatten(0, 2),
-            first=view * (rows * columns),
+            first=torch.stack([first, first + columns], 1),
             columns=0 * view + columns,
-            size=torch.tensor([[rows, columns]], device=images.device).expand(images.shape[0], 2),
+            last=torch.tensor([[columns - 1, rows - 1]], device=images.device).expand(images.shape[0], 2),
             scale=torch.ones_like(view, dtype=torch.double),
         )
 
     def of_cameras(self, index: Int[Tensor, "ray chosen"]) -> "MipLevels":
         """The levels of the cameras chosen for each ray: the fields get the shape [level, ray, 1, chosen, ...]."""
         at = index[:, None]
-        first, columns, size, scale = (field[:, 0, 0][:, at] for field in self[1:])
-        return MipLevels(self.pixels, first, columns, size, scale)
+        first, columns, last, scale = (field[:, 0, 0][:, at] for field in self[1:])
+        return MipLevels(self.pixels, first, columns, last, scale)
 
 
 def choose_levels(
@@ -190,7 +213,7 @@ class SourceCameras:
     ) -> "SourceCameras":
         """Cameras with their pyramids, which `context` caches; `silhouettes` are the masks of `views` by default."""
         if silhouettes is None:
-            silhouettes = Silhouettes(_masks(views), views.frame.cameras)
+            silhouettes = Silhouettes(view_masks(views), views.frame.cameras)
         if context is None:
             return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
         time = views.frame.time
@@ -239,7 +262,11 @@ class SourceCameras:
     @property
     def images(self) -> UInt8[Tensor, "view 5 height width"]:
         """RGB on black, mask and coverage by the proxy, of each source camera."""
-        return source_images(self.views.frame.rgb, _masks(self.views), self.views.depth)
+        width, height = self.cameras.max_size_px
+        images = [pyramid.levels[0][1:-1, 1:-1].movedim(2, 0) for pyramid in self.pyramids]
+        if any(image.shape[1:] != (height, width) for image in images):
+            images = [F.pad(own, (0, width - own.shape[2], 0, height - own.shape[1])) for own in images]
+        return torch.stack(images)
 
     @property
     def mask_sums(self) -> tuple[Int[Tensor, "view"], Int[Tensor, "silhouette"]]:
@@ -299,7 +326,7 @@ def source_images(
 def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
     """The pyramids of the `source_images` of every camera."""
     all_rgb = views.frame.per_camera("rgb")
-    all_masks = views.frame.per_camera("mask") or _masks(views)
+    all_masks = views.frame.per_camera("mask") or view_masks(views)
     all_depth = views.per_camera("depth")
 
     def base(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 5"]:
@@ -341,7 +368,7 @@ def downsample2x(image: UInt8[Tensor, "rows columns channel"]) -> UInt8[Tensor, 
     return F.pad(means.to(torch.uint8).permute(1, 2, 0), (0, 0, 1, 1, 1, 1))
 
 
-def _masks(views: ContextViews) -> UInt8[Tensor, "view height width"]:
+def view_masks(views: ContextViews) -> UInt8[Tensor, "view height width"]:
     """The views' masks; what the proxy covers if they have none."""
     if views.frame.mask is None:
         return (255 * (views.depth > 0)).to(torch.uint8)

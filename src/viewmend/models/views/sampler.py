@@ -297,31 +297,53 @@ def _average_all(*groups: Sequence[_Boxes]) -> list[list[np.ndarray]]:
 
 def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     """The reference of `sample_fill_rays`."""
-    images = sources.images
-    depth = MipLevels.full(sources.views.depth[:, None])
     shape_side, half_colour_side, silhouette_side = _box_sides(*sources.mask_sums)
+    projected, in_silhouettes = _project_into_all(rays, sources)
+
+    # Images, with the proxy's depth as the last channel, and means of colours and of shapes over boxes
+    images = torch.cat([sources.images.float(), sources.views.depth[:, None]], 1)
+    boxes = [(2, half_colour_side), (1, shape_side)]
+    at_points, colours, shapes = _sample_with_means(images, boxes, projected)
+    fine, coverage, covered_depth = at_points.split((RGB_MASK, 1, 1), -1)
+    around = torch.cat([colours[..., :3], shapes[..., 3:RGB_MASK_COVERAGE]], -1)
 
     # Distance behind the proxy: the mean depth of the pixels around that have one
-    projected, in_silhouettes = _project_into_all(rays, sources)
-    fine = sample_level(MipLevels.full(images), projected, RGB_MASK_COVERAGE)
-    coverage = fine[..., RGB_MASK]
-    covered_depth = 255 * sample_level(depth, projected, 1)[..., 0]  # depths are divided by 255, too
-    surface = covered_depth / coverage.clamp_min(MIN_COVERAGE)
-    behind = torch.where(coverage > MIN_COVERAGE, projected.z_m - surface, 0.0) / rays.scale.size_m
-
-    # What each camera shows
-    shapes = BoxSums.of(images[:, 3:]).means(projected.uv_px, shape_side)
-    half = images[:, :3]
-    for axis in (2, 3):  # by index: `torch.export` does not know the strides of a slice with steps
-        half = half.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
-    colours = BoxSums.of(half).means(projected.uv_px / 2, half_colour_side)
-    around = torch.cat([colours, shapes], -1)
-    features = _camera_features(rays, sources, projected, fine[..., :RGB_MASK], around, behind, torch.tanh)
+    surface = 255 * covered_depth / coverage.clamp_min(MIN_COVERAGE)  # depths were divided by 255, too
+    distance = projected.z_m - surface[..., 0]
+    behind = torch.where(coverage[..., 0] > MIN_COVERAGE, distance, 0.0) / rays.scale.size_m
+    features = _camera_features(rays, sources, projected, fine, around, behind, torch.tanh)
 
     smallest = _smallest_rig_masks(sources, in_silhouettes, silhouette_side)
     return RaySamples(
         features, 0 * features[..., 0], F.pad(smallest, (NUM_STATISTICS - smallest.shape[-1], 0))
     )
+
+
+def _sample_with_means(
+    images: Float[Tensor, "view channel height width"],
+    boxes: Sequence[tuple[int, Int[Tensor, ""]]],
+    projected: Projections,
+) -> Sequence[Float[Tensor, "ray sample view channel"]]:
+    """Images at the projections, and their means over boxes, divided by 255.
+
+    Each of `boxes` is a step and a side: every so many rows and columns are averaged over boxes of so many of them.
+    """
+    if torch.compiler.is_exporting():  # the sides depend on the inputs
+        found = [sample_level(MipLevels.full(images), projected, images.shape[1])]
+        for step, side in boxes:
+            every = images
+            for axis in (2, 3):  # by index: `torch.export` does not know the strides of a slice with steps
+                every = every.index_select(axis, torch.arange(0, images.shape[axis], step))
+            found.append(BoxSums.of(every).means(projected.uv_px / step, side))
+        return found
+
+    levels = [images]
+    scales = [1.0]
+    for step, side in boxes:
+        every = images[:, :, ::step, ::step]
+        levels.append(F.avg_pool2d(every, int(side), ceil_mode=True, divisor_override=int(side) ** 2))
+        scales.append(1 / (step * int(side)))
+    return sample_level(MipLevels.scaled(levels, scales), projected, images.shape[1]).unbind(0)
 
 
 def _camera_features(
@@ -343,7 +365,7 @@ def _camera_features(
     differences = squash(behind[..., None] / behind.new_tensor([NEAR, FAR])).float()
     single_channels = torch.stack([cosines, is_source, projected.in_view.float()], -1)
     features = torch.cat([fine, differences, single_channels, wide], -1)
-    return torch.where(projected.in_view[..., None], features, 0.0)
+    return features * projected.in_view[..., None]
 
 
 def _distance_behind(
@@ -360,23 +382,26 @@ def _distance_behind(
     else:
         camera = chosen[:, None]
     column, row = projected.uv_px.long().unbind(-1)
-    index = camera * (rows * columns) + row * columns + column
-    surface = _look_up(depth.reshape(-1, 1), index)[..., 0].double()
-    return torch.where(surface > 0, projected.z_m - surface, 0.0) / rays.scale.size_m
+    if torch.compiler.is_exporting():
+        index = camera * (rows * columns) + row * columns + column
+        surface = _look_up(depth.reshape(-1, 1), index)[..., 0]
+    else:
+        surface = depth[camera, row, column]
+    return (projected.z_m - surface) * (surface > 0) / rays.scale.size_m
 
 
 def _closeness(
     cosine: Float[Tensor, "ray sample *view"], depth_difference: Float[Tensor, "ray sample *view"]
 ) -> Float[Tensor, "ray sample *view"]:
     """Prior weights, not normalised: high for cameras near the viewer, unless the sample is far behind the proxy."""
-    return (4 * cosine).exp() / (1 + (6 * depth_difference).exp())
+    return (4 * cosine).exp() * (-6 * depth_difference).sigmoid()
 
 
 def _look_up(
-    table: Shaped[Tensor, "row channel"], index: Int[Tensor, "*sample"]
-) -> Shaped[Tensor, "*sample channel"]:
+    table: Shaped[Tensor, "row *channel"], index: Int[Tensor, "*sample"]
+) -> Shaped[Tensor, "..."]:
     """Rows of a table. ONNX Runtime gathers by a list of indices much faster than by an array of them."""
-    return table.index_select(0, index.flatten()).view(*index.shape, table.shape[1])
+    return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
 
 
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
@@ -433,16 +458,11 @@ def project_rays(rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] |
         start = start[chosen][:, None]
         size = size[chosen][:, None]
     z = rays.z_m.double()[..., None]
-    projected = per_metre[:, None] * z[..., None] + start
+    projected = torch.addcmul(start, per_metre[:, None], z[..., None])
     w = projected[..., 2]
-    front = (z > 0) & (w > 1e-6)
-    uv = projected[..., :2] / torch.where(front, w, 1.0)[..., None]
-    in_view = front & ((uv >= 0) & (uv < size)).all(-1)
-    return Projections(
-        uv_px=torch.where(in_view[..., None], uv, 0.0),
-        z_m=torch.where(in_view, w, 0.0),
-        in_view=in_view,
-    )
+    uv = projected[..., :2] / w.clamp_min(1e-6)[..., None]
+    in_view = (z > 0) & (w > 1e-6) & ((uv >= 0) & (uv < size)).all(-1)
+    return Projections(uv_px=uv * in_view[..., None], z_m=w * in_view, in_view=in_view)
 
 
 def _project_into_all(
@@ -488,9 +508,9 @@ def viewing_cosines(
         b_c = b_c.gather(1, chosen)
         c_c = c_c[chosen][:, None]
     b_c = b_c[:, None]
-    along = z * b_b + b_c
-    squared_length = z * (along + b_c) + c_c
-    return along / (squared_length * b_b).clamp_min(1e-24).sqrt()
+    along = torch.addcmul(b_c, z, b_b)
+    squared_length = torch.addcmul(c_c, z, along + b_c)
+    return along * (squared_length * b_b).clamp_min(1e-24).rsqrt()
 
 
 def sample_level(
@@ -501,20 +521,21 @@ def sample_level(
     Meaningless where a sample is not in view.
     """
     position = projected.uv_px * levels.scale[..., None] + 0.5
-    first = position.floor()
-    share = (position - first).float()
-    column, row = first.long().unbind(-1)
-    corner = levels.first + row * levels.columns + column
-
-    # The four pixels around each position
+    whole = position.long()
+    share = (position - whole).float()
+    column, row = whole.unbind(-1)
+    offset = row * levels.columns + column
     pixels = levels.pixels[:, :channels]
     if torch.compiler.is_exporting():
-        return _between_four(pixels, corner, corner + levels.columns, share) / 255
-    tap = torch.arange(2, device=corner.device)
-    index = corner[..., None, None] + levels.columns[..., None, None] * tap[:, None] + tap
-    across, down = torch.stack([1 - share, share], -1).unbind(-2)
-    weight = down[..., :, None] * across[..., None, :]
-    return (weight[..., None] * _look_up(pixels, index)).sum((-3, -2)) / 255
+        upper, lower = (offset + first for first in levels.first.unbind(-1))
+        return _between_four(pixels, upper, lower, share) / 255
+
+    # Two pixels in each of two rows; those of a row follow each other
+    neighbours = pixels.unfold(0, 2, 1)
+    left, right = (_look_up(neighbours, offset[..., None] + levels.first) / 255).unbind(-1)
+    across, down = share[..., None].unbind(-2)
+    upper, lower = left.lerp(right, across[..., None]).unbind(-2)
+    return upper.lerp(lower, down)
 
 
 def _between_four(
@@ -540,15 +561,14 @@ def sample_level_cubic(
 ) -> Float[Tensor, "ray sample view channel"]:
     """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
     position = projected.uv_px * levels.scale[..., None] + 0.5
-    first = position.floor()
-    share = (position - first).float()
+    whole = position.long()
+    share = (position - whole).float()
 
     # The sixteen pixels around each position, or those at the border
     tap = torch.arange(-1, 3, device=share.device)
-    last = (levels.size - 1).flip(-1)[..., None]
-    place = (first.long()[..., None] + tap).clamp_min(0)
-    column, row = torch.minimum(place, last).unbind(-2)
-    index = (levels.first[..., None] + row * levels.columns[..., None])[..., None] + column[..., None, :]
+    place = (whole[..., None] + tap).clamp_min(0)
+    column, row = torch.minimum(place, levels.last[..., None]).unbind(-2)
+    index = (levels.first[..., :1] + row * levels.columns[..., None])[..., None] + column[..., None, :]
     squared = share * share
     powers = torch.stack([torch.ones_like(share), share, squared, squared * share], -1)
     across, down = (powers @ share.new_tensor(CATMULL_ROM)).unbind(-2)
@@ -581,21 +601,18 @@ def _smallest_rig_masks(
     sources: SourceCameras, projected: Projections, side: Int[Tensor, ""]
 ) -> Float[Tensor, "ray sample 4"]:
     """The smallest masks of all cameras of the rig, single and averaged over boxes of this side."""
-    masks = sources.silhouettes.mask[:, None]
-    silhouettes = sample_level(MipLevels.full(masks), projected, 1)
-    means = BoxSums.of(masks).means(projected.uv_px, side)
-    return _smallest_masks(projected, torch.stack([silhouettes[..., 0], means[..., 0]]))
+    masks = sources.silhouettes.mask[:, None].float()
+    silhouettes = _sample_with_means(masks, [(1, side)], projected)
+    return _smallest_masks(projected, torch.stack(tuple(silhouettes))[..., 0])
 
 
 def _smallest_masks(
     projected: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
 ) -> Float[Tensor, "ray sample 4"]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
-    # ONNX has no `topk` of an unknown number of cameras
     seen = torch.where(projected.in_view, masks, 1.0)
-    first = seen.argmin(-1, keepdim=True)
-    others = torch.where(torch.arange(seen.shape[-1], device=seen.device) == first, 1.0, seen)
-    of_masks, of_means = torch.stack([seen.amin(-1), others.amin(-1)], -1)
+    at_least_two = F.pad(seen, (0, 1), value=1.0)
+    of_masks, of_means = at_least_two.topk(2, largest=False).values
     return torch.cat([of_masks, of_means], -1)
 
 
