@@ -56,6 +56,7 @@ from viewmend.models.views.grid import (
 )
 from viewmend.models.views.prediction import (
     DepthDistribution,
+    HypothesisMeans,
     SurfacePoints,
     ViewPrediction,
     surface_points,
@@ -141,14 +142,6 @@ class CandidateColours(NamedTuple):
         return torch.stack([self.trusted, self.single, self.soft, self.rendered], 1)
 
 
-class HypothesisMeans(NamedTuple):
-    """The means over the depth hypotheses of each pixel's ray, interpolated between cells."""
-
-    colour: Float[Tensor, "pixel 3"]
-    """RGB in [0, 1], not multiplied by alpha."""
-    mask: Float[Tensor, "pixel 1"]
-
-
 class ViewSynthNet(Network):
     """Predicts colour, alpha, confidence and depth of pixels on the proxy and its rim.
 
@@ -219,10 +212,10 @@ class ViewSynthNet(Network):
             allow_large_cells: whether a magnified view gets larger cells (`LARGE_CELLS_FROM`).
                 Training and exported models do not use them.
         """
-        if filled is None:
-            filled = self.fill_holes(view, sources)
         if scale is None:
             scale = SceneScale.of(view)
+        if filled is None:
+            filled = self.fill_holes(view, sources)
         with_rim = replace(view, depth=rim_depth(view.depth))
         has_depth = with_rim.depth > 0
         predicted = has_depth if where is None else where & has_depth
@@ -275,7 +268,8 @@ class ViewSynthNet(Network):
         image = ViewImage.of(view, filled, predicted)
         distribution = self._depth_distribution(with_rim, sources, scale, predicted, image)
         pixels = torch.nonzero(predicted)
-        surface = surface_points(with_rim.depth, scale, pixels, distribution)
+        shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
+        surface = surface_points(with_rim.depth, scale, pixels, distribution, shares)
         found = torch.stack([surface.depth, surface.probability], 1)
         depth, confidence = scatter_to_image(found, pixels, view.mask.shape)
         return DepthMap(depth, confidence)
@@ -391,7 +385,8 @@ class ViewSynthNet(Network):
         """Samples the cameras on the surface that each pixel shows, and blends them."""
         # Sample the cameras at the depth found: each pixel's ray has one sample, which is [:, 0] below
         stop_if_cancelled()
-        surface = surface_points(view.depth, scale, pixels, distribution)
+        means = HypothesisMeans.of(distribution, pixels)
+        surface = surface_points(view.depth, scale, pixels, distribution, means.probability)
         rays = surface_rays(view, scale, pixels, surface, distribution)
         samples = sample_rays(rays, sources, step_px=1.0, cubic=True)
 
@@ -401,7 +396,6 @@ class ViewSynthNet(Network):
         mask = aggregated.mask[:, 0].squeeze(1)
 
         # The last convolutions score the candidate colours, and predict alpha, confidence and gains
-        means = hypothesis_means(distribution, pixels)
         colours = candidate_colours(samples.features[:, 0], aggregated, means, image, pixels)
         statistics = RayStatistics.unstack(samples.statistics[:, 0])
         inputs = pixel_inputs(colours, mask, means.mask, statistics, surface, image, pixels)
@@ -546,16 +540,6 @@ def candidate_colours(
 
     rows, columns = pixels.unbind(1)
     return CandidateColours(trusted, single, means.colour, image.filled[:, rows, columns].T)
-
-
-def hypothesis_means(distribution: DepthDistribution, pixels: Pixels) -> HypothesisMeans:
-    """The means over the depth hypotheses of the rays of pixels (row, column)."""
-    probability = distribution.logits.softmax(1)[..., None]
-    cell_colour = (probability * distribution.samples.colour).sum(1)
-    cell_mask = (probability * distribution.samples.mask).sum(1)
-    means = distribution.interpolate(torch.cat([cell_colour, cell_mask], 1), pixels)
-    colour, mask = means.split((3, 1), 1)
-    return HypothesisMeans(unpremultiply(colour, mask), mask)
 
 
 def pixel_inputs(

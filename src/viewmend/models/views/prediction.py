@@ -74,21 +74,37 @@ class DepthDistribution(NamedTuple):
         own = pixels // self.cell_px
         from_center = (pixels % self.cell_px + 0.5) / self.cell_px - 0.5
         last = torch.tensor(self.cell_index.shape, device=own.device) - 1
-        neighbour = torch.minimum((own + from_center.sign().long()).clamp(min=0), last)
-        own_row, own_column = own.unbind(1)
-        next_row, next_column = neighbour.unbind(1)
-        row_weight, column_weight = from_center.abs().to(padded).unbind(1)
+        neighbour = torch.minimum((own + from_center.sign().long()).clamp_min(0), last)
+        row, column = torch.stack([own, neighbour], -1).unbind(1)
+        share = from_center.abs().to(padded)
+        row_weight, column_weight = torch.stack([1 - share, share], -1).unbind(1)
 
         # The weighted sum of the four cells around the pixel
-        corners = (
-            (own_row, own_column, (1 - row_weight) * (1 - column_weight)),
-            (own_row, next_column, (1 - row_weight) * column_weight),
-            (next_row, own_column, row_weight * (1 - column_weight)),
-            (next_row, next_column, row_weight * column_weight),
-        )
-        parts = [weight[:, None] * padded[self.cell_index[row, column]] for row, column, weight in corners]
-        total = torch.stack(parts).sum(0)
+        index = self.cell_index[row[:, :, None], column[:, None, :]].flatten(1)
+        weight = (row_weight[:, :, None] * column_weight[:, None, :]).flatten(1)
+        total = (weight[..., None] * padded[index]).sum(1)
         return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
+
+
+class HypothesisMeans(NamedTuple):
+    """The depth hypotheses of pixels' rays, interpolated between cells, and means over them."""
+
+    probability: Float[Tensor, "pixel sample"]
+    """Probability of the surface being at each hypothesis."""
+    colour: Float[Tensor, "pixel 3"]
+    """Mean RGB in [0, 1], not multiplied by alpha."""
+    mask: Float[Tensor, "pixel 1"]
+    """Mean mask."""
+
+    @classmethod
+    def of(cls, distribution: DepthDistribution, pixels: Pixels) -> "HypothesisMeans":
+        """Those of pixels (row, column)."""
+        probability = distribution.logits.softmax(1)
+        cell_colour = (probability[..., None] * distribution.samples.colour).sum(1)
+        cell_mask = (probability[..., None] * distribution.samples.mask).sum(1)
+        found = distribution.interpolate(torch.cat([probability, cell_colour, cell_mask], 1), pixels)
+        shares, colour, mask = found.split((len(OFFSETS), 3, 1), 1)
+        return cls(shares, unpremultiply(colour, mask), mask)
 
 
 class SurfacePoints(NamedTuple):
@@ -140,46 +156,49 @@ class ViewPrediction(NamedTuple):
             keep_islands: keep the `artefact_islands`, which are removed otherwise.
         """
         shape = view.mask.shape
-        rgb = scatter_to_image(self.rgb, self.pixels, shape)
-        alpha = scatter_to_image(self.alpha[:, None], self.pixels, shape)[0]
-        confidence = scatter_to_image(self.confidence[:, None], self.pixels, shape)[0]
-        depth = scatter_to_image(self.depth[:, None], self.pixels, shape)[0]
+        values = torch.cat([self.rgb, torch.stack([self.alpha, self.confidence, self.depth], 1)], 1)
+        planes = scatter_to_image(values, self.pixels, shape)
+        rgb = planes[:3]
+        alpha = planes[3]
         if fill is not None:
             mixed = RAY_FILL_SHARE * fill + (1 - RAY_FILL_SHARE) * rgb
             under_alpha = torch.minimum(mixed, alpha)  # the fill has no alpha of its own
             rgb = torch.where(predicted & view.holes, under_alpha, rgb)
+            planes = torch.cat([rgb, planes[3:]])
         if not keep_islands:
-            colour = torch.where(predicted, rgb.amax(0), view.rgb.amax(0))
+            colour = torch.where(predicted, rgb, view.rgb).amax(0)
             opacity = torch.where(predicted, alpha, view.mask)
-            keep = ~artefact_islands(colour, opacity, predicted)
-            rgb = rgb * keep
-            alpha = alpha * keep
-            confidence = confidence * keep
-            depth = depth * keep
+            planes = planes * ~artefact_islands(colour, opacity, predicted)
+        rgb = planes[:3]
+        alpha, confidence, depth = planes[3:]
 
         E = view.error
+        rest = 1 - E
         changed = predicted | faded
 
         # The confidence of a pixel that is not predicted is 1 on the subject and 0 elsewhere
         return CompletedView(
             view,
             rgb=blend(view.rgb, E, rgb, changed.to(E)),
-            alpha=torch.where(changed, E * alpha + (1 - E) * view.mask, view.mask),
-            confidence=torch.where(predicted, E * confidence + (1 - E), view.mask),
+            alpha=torch.where(changed, E * alpha + rest * view.mask, view.mask),
+            confidence=torch.where(predicted, E * confidence + rest, view.mask),
             depth=torch.where(predicted, depth * (alpha > 0.5), view.depth),
         )
 
 
 def surface_points(
-    proxy_depth: Plane, scale: SceneScale, pixels: Pixels, distribution: DepthDistribution
+    proxy_depth: Plane,
+    scale: SceneScale,
+    pixels: Pixels,
+    distribution: DepthDistribution,
+    shares: Float[Tensor, "pixel sample"],
 ) -> SurfacePoints:
     """The points that pixels show, by the depth distribution of the cells around them.
 
     A pixel's point lies behind its own depth on the proxy, or behind that of its cell, if the cell
-    has the depth of another surface in front of it.
+    has the depth of another surface in front of it. `shares` are the probabilities of the depth hypotheses.
     """
     # The most probable hypothesis, and the mean offset around it
-    shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
     best = shares.argmax(1)
     around = torch.stack([best - 1, best, best + 1], 1).clamp(0, len(OFFSETS) - 1)
     weight = shares.gather(1, around) + 1e-6
