@@ -14,6 +14,7 @@ numbers, are those of the paper.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -303,7 +304,7 @@ class IncompleteView:
         """Pixels to re-synthesise: those with E > 0 that are not only attenuated."""
         return self.error > 0 if self.fade is None else (self.error > 0) & (self.fade == 0)
 
-    @property
+    @cached_property
     def holes(self) -> Bool[Tensor, "height width"]:
         """Pixels of the proxy that no source view colours: the paper's E, whatever the error rule."""
         return (self.mask > 0) & ~(self.weights.sum(0) > 0)  # seven times faster than `any` along an axis

@@ -48,7 +48,7 @@ class BoxSums(NamedTuple):
         """Sums above and left of corners; corners outside an image are moved to its border."""
         image = torch.arange(self.values.shape[0], device=row.device)[:, None]
         rows, columns = self.values.shape[1:3]
-        inside_row = row.clamp(0).clamp_max(rows - 1)
-        inside_column = column.clamp(0).clamp_max(columns - 1)
+        inside_row = row.clamp(0, rows - 1)
+        inside_column = column.clamp(0, columns - 1)
         first = (image * rows + inside_row) * columns
         return self.values.flatten(0, 2)[first[..., :, None] + inside_column[..., None, :]]

@@ -97,9 +97,8 @@ def scatter_to_image(
     values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
 ) -> Shaped[Tensor, "channel rows columns"]:
     """An image of this shape with the values `at` these rows and columns, and zeros elsewhere."""
-    image = values.new_zeros(shape[0] * shape[1], values.shape[1])
-    image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values)
-    return image.view(*shape, -1).permute(2, 0, 1)
+    image = values.new_zeros(*shape, values.shape[1])
+    return image.index_put_(tuple(at.unbind(1)), values).permute(2, 0, 1)
 
 
 def detail_bands(

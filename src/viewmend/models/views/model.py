@@ -229,15 +229,21 @@ class ViewSynthNet(Network):
         return self._blend(with_rim, sources, scale, torch.nonzero(predicted), image, distribution)
 
     @torch.no_grad()
-    def fill_holes(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
+    def fill_holes(
+        self,
+        view: IncompleteView,
+        sources: SourceCameras | None,
+        quick: bool = False,
+        scale: SceneScale | None = None,
+    ) -> Image:
         """The image of the whole view, with holes filled coarsely.
 
         `RayFill` fills them from the cameras. If `quick`, or if the model has no `RayFill`, they are
-        filled from the pixels around them.
+        filled from the pixels around them. `scale` is the view's, if it is known.
         """
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
-        return self.coarse(replace(view, error=view.holes.to(view.error)), sources).float()
+        return self.coarse(replace(view, error=view.holes.to(view.error)), sources, scale).float()
 
     def source_names(self, view: IncompleteView) -> tuple[str, ...]:
         """Names of the source cameras that are sampled for a view, the closest first."""
@@ -315,8 +321,9 @@ class ViewSynthNet(Network):
         # Otherwise, `where` is predicted. At reduced quality, E and hence `where` are already limited to a
         # fraction of the subject
         reduced_quality = fraction is not None
-        filled = self.fill_holes(view, sources, quick=reduced_quality)
-        prediction = self(view, sources, where=where, filled=filled, allow_large_cells=True)
+        scale = SceneScale.of(view)
+        filled = self.fill_holes(view, sources, quick=reduced_quality, scale=scale)
+        prediction = self(view, sources, scale, where=where, filled=filled, allow_large_cells=True)
 
         # In holes, the prediction is blended with the coarse fill, if `RayFill` has made it
         used_ray_fill = self.coarse is not None and not reduced_quality

@@ -34,24 +34,30 @@ class SceneScale:
     size_m: float | Float[Tensor, ""]
     """Size of the subject in metres: the root of its area at its median depth."""
     depth_m: float | Float[Tensor, ""]
-    """Median z-depth of the proxy in metres. Both are tensors while `torch.export` traces."""
+    """Median z-depth of the proxy in metres."""
+    subject_px: float | Float[Tensor, ""]
+    """Root of the subject's area in the view. All three are tensors while `torch.export` traces."""
 
     @classmethod
     def of(cls, view: IncompleteView) -> "SceneScale":
-        """The scale of a view; 1 for both if the proxy covers nothing."""
+        """The scale of a view; 1 metre for both lengths if the proxy covers nothing."""
         covered = view.depth > 0
         if torch.compiler.is_exporting():
             count = covered.sum()
             ordered = torch.where(covered, view.depth, torch.inf).flatten().sort().values
             median = ordered[((count - 1).clamp_min(0) // 2)]
-            size = _size_m((view.mask > 0).sum(), median, view.camera)
-            return cls(*(torch.where(count > 0, value, 1.0) for value in (size, median)))
+            area = (view.mask > 0).sum()
+            size = _size_m(area, median, view.camera)
+            lengths_m = (torch.where(count > 0, value, 1.0) for value in (size, median))
+            return cls(*lengths_m, area.sqrt().double())
         area_px = (view.mask > 0).sum()
         median_m = torch.where(covered, view.depth, torch.nan).nanmedian()
         area, median = torch.stack([area_px.double(), median_m.double()]).cpu()  # one copy from the device
+        subject_px = float(area.float().sqrt())
         if bool(median.isnan()):
-            return cls(1.0, 1.0)
-        return cls(float(_size_m(area.long(), median.float(), view.camera.on_host)), float(median))
+            return cls(1.0, 1.0, subject_px)
+        size_m = _size_m(area.long(), median.float(), view.camera.on_host)
+        return cls(float(size_m), float(median), subject_px)
 
 
 def _size_m(area_px: Int[Tensor, ""], median_m: Float[Tensor, ""], camera: Cameras) -> Float[Tensor, ""]:

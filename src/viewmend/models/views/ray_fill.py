@@ -59,8 +59,10 @@ POINT_FEATURES = 16
 PIXELS_AT_ONCE = 512
 """A chunk without gradients has this many pixels: the system allocates larger buffers page by page
 each time, which takes longer than the computation."""
+GPU_PIXELS_AT_ONCE = 8192
+"""A chunk without gradients has this many pixels on a GPU, where memory is the limit."""
 PIXELS_STEP = 64
-"""Layers run on multiples of this many pixels. PyTorch compiles and keeps convolutions and GELUs for each
+"""On the CPU, layers run on multiples of this many pixels. PyTorch compiles and keeps convolutions and GELUs for each
 number of pixels; for all numbers, that would be slow, and fragment the memory of a server."""
 
 
@@ -146,11 +148,17 @@ class RayFill(Network, Fill):
         self.choose = nn.Linear(20 * width, points + 2)
 
     @one_thread()
-    def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Image:
-        """The view's image with all of E filled; None for `sources` leaves the smooth fill."""
-        smooth = fill(view.rgb, view.error > 0, view.mask > 0)
-        pixels = torch.nonzero((view.error > 0) & (view.depth > 0).any())
-        colours = self.mix(gather_ray_inputs(view, sources, pixels, smooth))
+    def forward(
+        self, view: IncompleteView, sources: SourceCameras | None, scale: SceneScale | None = None
+    ) -> Image:
+        """The view's image with all of E filled; None for `sources` leaves the smooth fill.
+
+        `scale` is the view's, if it is known.
+        """
+        missing = view.error > 0
+        smooth = fill(view.rgb, missing, view.mask > 0)
+        pixels = torch.nonzero(missing & (view.depth > 0).any())
+        colours = self.mix(gather_ray_inputs(view, sources, pixels, smooth, scale))
         return smooth.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 
     def fill_view(self, view: IncompleteView, context: ContextProvider) -> Image:
@@ -163,7 +171,9 @@ class RayFill(Network, Fill):
         features, smallest, window, neighbourhoods, index = inputs
         if torch.compiler.is_exporting():
             return self._mix(features, smallest, window, self.far(neighbourhoods).flatten(1)[index])
-        size = max(1, len(index)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
+        size = PIXELS_AT_ONCE if features.device.type == "cpu" else GPU_PIXELS_AT_ONCE
+        if torch.is_grad_enabled():
+            size = max(1, len(index))
         with self.autocast():
             far = [self.far(_round_up(part)).flatten(1)[: len(part)] for part in neighbourhoods.split(size)]
             per_pixel = (features, smallest, window, torch.cat(far)[index])
@@ -240,20 +250,27 @@ class RayFill(Network, Fill):
 
 
 def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
-    """The values, padded with zeros to a multiple of `PIXELS_STEP` pixels."""
+    """The values, on the CPU padded with zeros to a multiple of `PIXELS_STEP` pixels."""
+    if values.device.type != "cpu":
+        return values
     return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
 
 def gather_ray_inputs(
-    view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, smooth: Image | None = None
+    view: IncompleteView,
+    sources: SourceCameras | None,
+    pixels: Pixels,
+    smooth: Image | None = None,
+    scale: SceneScale | None = None,
 ) -> RayInputs:
     """The network's inputs for pixels (row, column) of a view.
 
-    `smooth` is the image with E filled smoothly, if the caller has it.
+    `smooth` is the image with E filled smoothly, and `scale` that of the view, if the caller has them.
     """
     if smooth is None:
         smooth = fill(view.rgb, view.error > 0, view.mask > 0)
-    scale = SceneScale.of(view)
+    if scale is None:
+        scale = SceneScale.of(view)
     if sources is None:
         features = view.depth.new_zeros(len(pixels), len(OFFSETS), 1, sum(CAMERA_CHANNELS))
         smallest = view.depth.new_ones(len(pixels), len(OFFSETS), 4)
@@ -307,49 +324,38 @@ def multi_scale_context(
     depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
     sums = BoxSums.of(torch.cat([smooth, view.mask[None], view.error[None], depth[None]])[None])
 
-    # The cells that pixels are in
-    subject_px = (view.mask > 0).sum().sqrt().double()
-    middle = view.camera.K[0, :2, 2].floor().long().flip(0)
-    sides = [box_side_px(size, subject_px) for size in CELLS]
-    before = [-middle % side for side in sides]
-    cells = _cells_of(pixels, sides, before)
+    # The cells of each size that pixels are in, the first of which begin `before` pixels outside the view
+    sides = torch.stack([box_side_px(size, scale.subject_px) for size in CELLS])[:, None]
+    middle = (view.camera if torch.compiler.is_exporting() else view.camera.on_host).K[0, :2, 2]
+    before = (-middle.floor().long().flip(0) % sides).to(pixels.device)
+    sides = sides.to(pixels.device)
+    cells = (pixels[:, None] + before) // sides
     if torch.compiler.is_exporting():
         firsts, index = _first_pixels(cells, sides, before, view.mask.shape)
-        cells = _cells_of(firsts, sides, before)
+        cells = (firsts[:, None] + before) // sides
     else:
         cells, index = cells.unique(dim=0, return_inverse=True)
 
     # The means of the cells around them
     reach = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device)
-    means = []
-    for side, offset, cell in zip(sides, before, cells.split(2, 1), strict=True):
-        rows, columns = ((cell[:, :, None] + reach) * side - offset[:, None]).split(1, 1)
-        means.append((sums.boxes(rows, columns)[:, 0] / side**2).float().movedim(-1, 1))
-    return torch.cat(means, 1), index
-
-
-def _cells_of(
-    pixels: Pixels, sides: Sequence[Int[Tensor, ""]], before: Sequence[Int[Tensor, "2"]]
-) -> Int[Tensor, "pixel 4"]:
-    """Row and column of each pixel's cell of each size. The first cells begin `before` pixels outside the view."""
-    return torch.cat([(pixels + offset) // side for side, offset in zip(sides, before, strict=True)], 1)
+    corners = (cells[..., None] + reach) * sides[..., None] - before[..., None]
+    rows, columns = corners.split(1, 2)
+    means = (sums.boxes(rows, columns)[:, :, 0] / sides[..., None, None] ** 2).float()
+    return means.movedim(-1, 2).flatten(1, 2), index
 
 
 def _first_pixels(
-    cells: Int[Tensor, "pixel 4"],
-    sides: Sequence[Int[Tensor, ""]],
-    before: Sequence[Int[Tensor, "2"]],
+    cells: Int[Tensor, "pixel size 2"],
+    sides: Int[Tensor, "size 1"],
+    before: Int[Tensor, "size 2"],
     shape: torch.Size,
 ) -> tuple[Int[Tensor, "neighbourhood 2"], Int[Tensor, "pixel"]]:
-    """The first pixel of each different row of `cells`, and the index of each row among them.
+    """The first pixel of each different element of `cells`, and the index of each element among them.
 
-    An exported model has no `unique` over rows. Cells of both sizes overlap in a rectangle, whose first pixel stands
+    An exported model has no `unique` over tensors. Cells of both sizes overlap in a rectangle, whose first pixel stands
     for them.
     """
-    corners = [
-        cell * side - offset for side, offset, cell in zip(sides, before, cells.split(2, 1), strict=True)
-    ]
-    corner = torch.stack(corners).amax(0).clamp_min(0)
+    corner = (cells * sides - before).amax(1).clamp_min(0)
     number = corner[:, 0] * shape[1] + corner[:, 1]
     present = torch.zeros(shape[0] * shape[1], dtype=torch.long)
     present = present.index_put((number,), torch.ones_like(number))

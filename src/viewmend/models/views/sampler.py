@@ -583,9 +583,9 @@ def _on_host(cameras: Cameras) -> Cameras:
     return cameras if cameras.K.device.type == "cpu" else cameras.on_host
 
 
-def box_side_px(size: float, subject_px: Float[Tensor, ""]) -> Int[Tensor, ""]:
-    """A length in subject sizes as whole pixels, at least 1."""
-    return (size * subject_px.double()).round().clamp_min(1).long()
+def box_side_px(size: float | Float[Tensor, "size"], subject_px: float | Tensor) -> Int[Tensor, "..."]:
+    """Lengths in subject sizes as whole pixels, at least 1."""
+    return torch.as_tensor(size * subject_px, dtype=torch.double).round().clamp_min(1).long()
 
 
 def _box_sides(
