@@ -80,7 +80,7 @@ class CachedFrame:
     def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
         """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered only once."""
         self._render(names)
-        width, height = self.frame.cameras.select(names).max_size_px
+        width, height = self.frame.cameras.on_host.select(names).max_size_px
         # Cut as `frame.select` cuts images
         return torch.stack([self.depths[name][:height, :width] for name in names])
 

@@ -216,9 +216,9 @@ class PackedSources(SourceCameras):
         """`SourceCameras.mask_sums`, of the inputs."""
         return self.images[:, 3].sum((1, 2)), self.silhouettes.mask.sum((1, 2))
 
-    def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
-        """Which cameras coloured the view: an input here, since cameras have no names."""
-        return self.coloured
+    def is_source(self, names: Sequence[str]) -> Float[Tensor, "view"]:
+        """1 for cameras that coloured the view: an input here, since cameras have no names."""
+        return self.coloured.float()
 
     def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> tuple[MipLevels, MipLevels]:
         """`SourceCameras.mips`."""
@@ -281,9 +281,9 @@ class PackedPyramids(NamedTuple):
         level = levels[:, None, None]
         columns = self.columns[level]
         first = self.first[level] + torch.arange(levels.shape[1]) * self.pixels.shape[1]
-        first_two = torch.stack([first, first + columns], -1)
         last = self.size[level].flip(-1) - 1
-        return MipLevels(self.pixels.flatten(0, 1), first_two, columns, last, 0.5 ** level.double())
+        rows = torch.stack([first, first + columns, columns], -1)
+        return MipLevels(self.pixels.flatten(0, 1), torch.cat([rows, last], -1), 0.5 ** level.double())
 
 
 def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -65,11 +65,12 @@ def fill(rgb: Image, missing: Pixels, subject: Pixels) -> Image:
     included: at a silhouette they are half background. In wide holes only pixels of the `subject`
     count; farther than `REACH_PX` from any of these, holes are filled by `pull_push`.
     """
-    near, _ = from_near(rgb, ~missing, missing)
-    wide = missing & spread(~spread(~missing))
+    known = ~missing
+    near, _ = from_near(rgb, known, missing)
+    wide = missing & spread(~spread(known))
     if not bool(wide.any()):
         return near  # then everything is within reach, too
-    filled, reached = from_near(rgb, ~missing & subject, missing)
+    filled, reached = from_near(rgb, known & subject, missing)
     deep = missing & ~reached
     if bool(deep.any()):
         filled = torch.where(deep, pull_push(filled, ~deep & subject), filled)
@@ -94,18 +95,17 @@ def _sum_around(image: Image) -> Image:
         length = image.shape[axis]
         pad = (0, 0, REACH_PX, REACH_PX) if axis == 1 else (REACH_PX, REACH_PX)
         around = F.pad(image, pad)
-        image = torch.zeros_like(image)
+        image = around.narrow(axis, REACH_PX, length).clone()
         for i in range(2 * REACH_PX + 1):
-            image.add_(around.narrow(axis, i, length), alpha=math.exp(-0.5 * (i - REACH_PX) ** 2))
+            if i != REACH_PX:
+                image.add_(around.narrow(axis, i, length), alpha=math.exp(-0.5 * (i - REACH_PX) ** 2))
     return image
 
 
 def spread(pixels: Pixels) -> Pixels:
     """Where a square of `THIN_PX` around a pixel contains any of them; there are none outside the image."""
     for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
-        around = F.pad(pixels, pad)
-        length = pixels.shape[axis]
-        pixels = torch.stack([around.narrow(axis, i, length) for i in range(THIN_PX)]).any(0)
+        pixels = F.pad(pixels, pad).unfold(axis, THIN_PX, 1).any(-1)
     return pixels
 
 

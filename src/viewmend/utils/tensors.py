@@ -136,5 +136,5 @@ def check_tensor(
 
 def extremes(images: Iterable[Tensor]) -> list[tuple[float, float]]:
     """The smallest and the largest number of each image, both NaN if any is; waits for a GPU only once."""
-    pairs = torch.stack([torch.stack(image.detach().aminmax()).float() for image in images])
-    return [(low, high) for low, high in pairs.tolist()]
+    found = torch.stack([extreme for image in images for extreme in image.detach().aminmax()])
+    return [(low, high) for low, high in found.view(-1, 2).float().tolist()]

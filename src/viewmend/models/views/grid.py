@@ -78,19 +78,16 @@ def upsample2x(
     return cut[:-1] / cut[-1:].clamp(min=1e-6)
 
 
-def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
+def nearest_depth(depth: Float[Tensor, "*image height width"]) -> Float[Tensor, "*image rows columns"]:
     """The smallest depth in each cell, metres, of the pixels that have one (above 0); 0 if no pixel has."""
-    height, width = depth.shape
-    far = F.pad(torch.where(depth > 0, depth, BEYOND_M), (0, width % 2, 0, height % 2), value=BEYOND_M)
-    nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
-    return torch.where(nearest < BEYOND_M, nearest, 0.0)
+    nearness = -torch.where(depth > 0, depth, BEYOND_M).view(-1, *depth.shape[-2:])
+    nearest = -F.max_pool2d(nearness, CELL_PX, ceil_mode=True)
+    return (nearest * (nearest < BEYOND_M)).view(*depth.shape[:-2], *nearest.shape[1:])
 
 
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
     """The mean of each cell; of a cell that reaches beyond the image, the mean of the part inside."""
-    height, width = image.shape[1:]
-    whole_cells = F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate")
-    return F.avg_pool2d(whole_cells, CELL_PX)[0]
+    return F.avg_pool2d(image, CELL_PX, ceil_mode=True)
 
 
 def scatter_to_image(

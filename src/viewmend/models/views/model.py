@@ -344,7 +344,7 @@ class ViewSynthNet(Network):
         `view` has depth on the rim, too.
         """
         # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
-        proxy_depth = nearest_depth(view.depth * predicted)
+        proxy_depth, whole_depth = nearest_depth(torch.stack([view.depth * predicted, view.depth]))
         cells = torch.nonzero(proxy_depth > 0)
         rows, columns = cells.unbind(1)
         proxy_z = proxy_depth[rows, columns][:, None]
@@ -354,9 +354,8 @@ class ViewSynthNet(Network):
         rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * proxy_z.new_tensor(OFFSETS), cameras)
 
         # Further inputs of the U-Net, in all cells: the rendered view, and all depth of the proxy and its rim
-        whole_depth = nearest_depth(view.depth)
         has_depth = whole_depth > 0
-        relative = torch.where(has_depth, ((whole_depth - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        relative = ((whole_depth - scale.depth_m) / scale.size_m).tanh() * has_depth
         means = cell_means(image.stacked())
         cell_channels = concatenate_channels(means, relative[None], has_depth[None].to(means))
 

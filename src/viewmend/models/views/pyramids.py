@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -74,14 +74,25 @@ class MipLevels(NamedTuple):
 
     pixels: Shaped[Tensor, "pixel channel"]
     """0 to 255, or metres."""
-    first: Int[Tensor, "*level view 2"]
-    """Indices of the first pixels of each image's first two rows."""
-    columns: Int[Tensor, "*level view"]
-    """Pixels from one row to the next."""
-    last: Int[Tensor, "*level view 2"]
-    """Column and row of each image's last pixel, which is in its border."""
+    layout: Int[Tensor, "*level view 5"]
+    """Where the pixels of each image are: `first`, `columns` and `last`."""
     scale: Float[Tensor, "*level view"]
     """Factor from positions in the camera's image to positions in this one."""
+
+    @property
+    def first(self) -> Int[Tensor, "*level view 2"]:
+        """Indices of the first pixels of each image's first two rows."""
+        return self.layout[..., :2]
+
+    @property
+    def columns(self) -> Int[Tensor, "*level view"]:
+        """Pixels from one row to the next."""
+        return self.layout[..., 2]
+
+    @property
+    def last(self) -> Int[Tensor, "*level view 2"]:
+        """Column and row of each image's last pixel, which is in its border."""
+        return self.layout[..., 3:]
 
     @classmethod
     def of(cls, pyramids: Sequence["Pyramid"], levels: Sequence[Sequence[int]]) -> "MipLevels":
@@ -121,15 +132,12 @@ class MipLevels(NamedTuple):
         first = count.cumsum(0) - count
         shape = (levels, 1, 1, len(sizes) // levels)
         layout = torch.stack([first, first + columns, columns, columns - 1, rows - 1], 1)
-        layout = layout.view(*shape, 5).to(pixels.device)
-        scale = torch.tensor(scales, dtype=torch.double).view(shape).to(pixels.device)
-        return cls(pixels, layout[..., :2], layout[..., 2], layout[..., 3:], scale)
+        scale = torch.tensor(scales, dtype=torch.double).view(shape)
+        return cls(pixels, layout.view(*shape, 5).to(pixels.device), scale.to(pixels.device))
 
     def at(self, level: int) -> "MipLevels":
         """One of the levels."""
-        return MipLevels(
-            self.pixels, self.first[level], self.columns[level], self.last[level], self.scale[level]
-        )
+        return MipLevels(self.pixels, self.layout[level], self.scale[level])
 
     @classmethod
     def full(cls, images: Shaped[Tensor, "view channel height width"]) -> "MipLevels":
@@ -139,19 +147,17 @@ class MipLevels(NamedTuple):
         # len(images) would make the number of cameras of an exported model constant.
         view = torch.arange(images.shape[0], device=images.device)
         first = view * (rows * columns)
+        sizes = [0 * view + size for size in (columns, columns - 1, rows - 1)]
         return cls(
             pixels=bordered.movedim(1, 3).flatten(0, 2),
-            first=torch.stack([first, first + columns], 1),
-            columns=0 * view + columns,
-            last=torch.tensor([[columns - 1, rows - 1]], device=images.device).expand(images.shape[0], 2),
+            layout=torch.stack([first, first + columns, *sizes], 1),
             scale=torch.ones_like(view, dtype=torch.double),
         )
 
     def of_cameras(self, index: Int[Tensor, "ray chosen"]) -> "MipLevels":
         """The levels of the cameras chosen for each ray: the fields get the shape [level, ray, 1, chosen, ...]."""
         at = index[:, None]
-        first, columns, last, scale = (field[:, 0, 0][:, at] for field in self[1:])
-        return MipLevels(self.pixels, first, columns, last, scale)
+        return MipLevels(self.pixels, self.layout[:, 0, 0][:, at], self.scale[:, 0, 0][:, at])
 
 
 def choose_levels(
@@ -280,11 +286,10 @@ class SourceCameras:
         of_views = torch.tensor([pyramid.mask_sum for pyramid in self.pyramids])
         return of_views, torch.tensor([pyramid.mask_sum for pyramid in self.silhouette_pyramids])
 
-    def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
-        """Which source cameras have one of these names."""
-        return torch.tensor(
-            [name in names for name in self.cameras.names], device=self.silhouettes.mask.device
-        )
+    def is_source(self, names: Sequence[str]) -> Float[Tensor, "view"]:
+        """1 for source cameras that have one of these names, else 0."""
+        device = self.silhouettes.mask.device
+        return torch.tensor([float(name in names) for name in self.cameras.names], device=device)
 
     def levels(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[list[list[int]]]:
         """Fine and wide level of each source camera, and of each silhouette; see `choose_levels`."""

@@ -217,19 +217,19 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     """The reference of `sample_rays`."""
     levels, silhouettes = sources.mips(rays.view.camera, step_px, rays.scale)
 
-    # The cameras chosen for each ray. An index that stands for no camera becomes that of the last one,
-    # which then has no sample in view.
+    # The cameras chosen for each ray. In an exported model, an index that stands for no camera becomes
+    # that of the last one, which then has no sample in view.
     chosen = None
     last = sources.cameras.K.shape[0] - 1
     if rays.cameras is not None:
-        chosen = rays.cameras.clamp_max(last)
+        chosen = rays.cameras.clamp_max(last) if torch.compiler.is_exporting() else rays.cameras
         levels = levels.of_cameras(chosen)
 
     # Positions in the cameras, and distances behind the proxy there
     projected, in_silhouettes = _project_into_all(rays, sources, chosen)
-    if rays.cameras is not None:
+    if rays.cameras is not None and torch.compiler.is_exporting():
         projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
-    behind = _distance_behind(rays, sources, projected, chosen)
+    behind = _distance_behind(sources, projected, chosen)
 
     # What each camera shows
     if cubic:
@@ -245,9 +245,8 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     prior = features.in_view * _closeness(features.viewing_cosine, features.depth_difference)
     prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
     mean = (prior * features.colour).sum(2)
-    square = (prior * features.colour.square()).sum(2)
-    variance = CONTRAST * (square - mean.square()).clamp_min(0)
     difference = features.in_view * (features.colour - mean[:, :, None])
+    variance = CONTRAST * (prior * difference.square()).sum(2)
 
     # The silhouettes of the whole rig
     smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
@@ -310,7 +309,7 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     # Distance behind the proxy: the mean depth of the pixels around that have one
     surface = 255 * covered_depth / coverage.clamp_min(MIN_COVERAGE)  # depths were divided by 255, too
     distance = projected.z_m - surface[..., 0]
-    behind = torch.where(coverage[..., 0] > MIN_COVERAGE, distance, 0.0) / rays.scale.size_m
+    behind = distance * (coverage[..., 0] > MIN_COVERAGE)
     features = _camera_features(rays, sources, projected, fine, around, behind, torch.tanh)
 
     smallest = _smallest_rig_masks(sources, in_silhouettes, silhouette_side)
@@ -356,22 +355,23 @@ def _camera_features(
     squash: Callable[[Tensor], Tensor],
     chosen: Int[Tensor, "ray view"] | None = None,
 ) -> Float[Tensor, "ray sample view 14"]:
-    """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
+    """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy, metres."""
     cosines = viewing_cosines(rays, sources.cameras, chosen).float()
-    is_source = sources.is_source(rays.view.source_views).float()
+    is_source = sources.is_source(rays.view.source_views)
     if chosen is not None:
         is_source = is_source[chosen][:, None]
     is_source = is_source.expand_as(cosines)
-    differences = squash(behind[..., None] / behind.new_tensor([NEAR, FAR])).float()
-    single_channels = torch.stack([cosines, is_source, projected.in_view.float()], -1)
-    features = torch.cat([fine, differences, single_channels, wide], -1)
-    return features * projected.in_view[..., None]
+    in_view = projected.in_view.float()[..., None]
+    saturation_m = behind.new_tensor([NEAR, FAR]) * rays.scale.size_m
+    differences = squash(behind[..., None] / saturation_m).float()
+    features = torch.cat([fine, differences, cosines[..., None], is_source[..., None], in_view, wide], -1)
+    return features * in_view
 
 
 def _distance_behind(
-    rays: Rays, sources: SourceCameras, projected: Projections, chosen: Int[Tensor, "ray view"] | None = None
+    sources: SourceCameras, projected: Projections, chosen: Int[Tensor, "ray view"] | None = None
 ) -> Float[Tensor, "ray sample view"]:
-    """Distance of samples behind the proxy, in subject sizes, by the depth of the nearest pixel in each camera.
+    """Distance of samples behind the proxy, metres, by the depth of the nearest pixel in each camera.
 
     With `chosen`, the projections are those into the cameras chosen for each ray.
     """
@@ -387,7 +387,7 @@ def _distance_behind(
         surface = _look_up(depth.reshape(-1, 1), index)[..., 0]
     else:
         surface = depth[camera, row, column]
-    return (projected.z_m - surface) * (surface > 0) / rays.scale.size_m
+    return (projected.z_m - surface) * (surface > 0)
 
 
 def _closeness(
@@ -397,9 +397,7 @@ def _closeness(
     return (4 * cosine).exp() * (-6 * depth_difference).sigmoid()
 
 
-def _look_up(
-    table: Shaped[Tensor, "row *channel"], index: Int[Tensor, "*sample"]
-) -> Shaped[Tensor, "..."]:
+def _look_up(table: Shaped[Tensor, "row *channel"], index: Int[Tensor, "*sample"]) -> Shaped[Tensor, "..."]:
     """Rows of a table. ONNX Runtime gathers by a list of indices much faster than by an array of them."""
     return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
 
@@ -430,7 +428,7 @@ def _without_ties(scores: Float[Tensor, "ray camera"]) -> Float[Tensor, "ray cam
 def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
     """The reference of the scores of `choose_cameras`."""
     projected = project_rays(rays, sources.cameras)
-    near = F.softsign(_distance_behind(rays, sources, projected) / NEAR)
+    near = F.softsign(_distance_behind(sources, projected) / (NEAR * rays.scale.size_m))
     return (projected.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
 
 
@@ -457,8 +455,8 @@ def project_rays(rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] |
         per_metre = per_metre.gather(1, chosen[..., None].expand(-1, -1, 3))
         start = start[chosen][:, None]
         size = size[chosen][:, None]
-    z = rays.z_m.double()[..., None]
-    projected = torch.addcmul(start, per_metre[:, None], z[..., None])
+    z = rays.z_m[..., None]
+    projected = torch.addcmul(start, per_metre[:, None], z[..., None].double())
     w = projected[..., 2]
     uv = projected[..., :2] / w.clamp_min(1e-6)[..., None]
     in_view = (z > 0) & (w > 1e-6) & ((uv >= 0) & (uv < size)).all(-1)
@@ -494,15 +492,15 @@ def viewing_cosines(
 ) -> Float[Tensor, "ray sample view"]:
     """Cosine of the angle at each sample between the viewer and each camera, or those chosen for each ray.
 
-    Seen from the sample, the viewer lies along b (the ray reversed), and the camera along z b + c,
-    where c leads from the viewer to the camera. All samples of a ray share b b, b c and c c.
+    Seen from the viewer, the sample lies along z b (b is the ray), and so it lies along z b + c seen from the
+    camera, where c leads from the camera to the viewer. All samples of a ray share b b, b c and c c.
     """
-    back = -rays.directions
+    ray = rays.directions
     z = rays.z_m.double()[..., None]
-    from_viewer = _on_host(cameras).centers.double() - rays.origin
-    c_and_square = torch.cat([from_viewer, from_viewer.square().sum(-1, keepdim=True)], 1).to(back.device)
-    b_c = back @ c_and_square[:, :3].T
-    b_b = back.square().sum(-1)[:, None, None]
+    to_viewer = rays.origin - _on_host(cameras).centers.double()
+    c_and_square = torch.cat([to_viewer, to_viewer.square().sum(-1, keepdim=True)], 1).to(ray.device)
+    b_c = ray @ c_and_square[:, :3].T
+    b_b = ray.square().sum(-1)[:, None, None]
     c_c = c_and_square[:, 3]
     if chosen is not None:
         b_c = b_c.gather(1, chosen)
