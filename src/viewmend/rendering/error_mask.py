@@ -121,7 +121,7 @@ def decide_error_mask(
     Raises:
         ValueError: the rule does not return a valid E, or `fraction` limits E and no model predicts errors.
     """
-    if evidence is not None:
+    if evidence is not None and rule != "holes":  # a rendered view has the holes as E
         view = replace(view, error=_apply_rule(rule, evidence))
     if fraction is None or not bool(((view.error > 0) & ~view.holes).any()):
         return view

@@ -104,7 +104,7 @@ def collate(
         valid = torch.ones(len(uvs), dtype=torch.bool, device=uvs.device)
         queries.append(target.tokens[target.incomplete])
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
-        parts = [_carry(frame, frames, target.view, config) for frame in frames]
+        parts = [_carry(frames, target.view, config)] if frames else []
         parts.append((uvs[~target.incomplete], valid[~target.incomplete]))
         key_positions.append(tuple(torch.cat(values) for values in zip(*parts, strict=True)))
         keys.append([*(frame.keys_values.to(own) for frame in frames), own])
@@ -120,19 +120,25 @@ def collate(
     )
 
 
-def _carry(
-    frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig
-) -> Positions:
-    """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
-    points = frame.points_world
-    valid = frame.valid
+def _carry(frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:
+    """C_G(x) of the patches of all frames, one after the other."""
+    points, valid = (
+        torch.cat(parts) for parts in zip(*(_lift(f, frames, view) for f in frames), strict=True)
+    )
+    uv, valid = reproject(points, valid, view.camera)
+    s = [torch.full_like(f.uv_px[:, :1], (view.time - f.time) / config.window) for f in frames]
+    return torch.cat([uv, torch.cat(s)], 1), valid
+
+
+def _lift(
+    frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView
+) -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
+    """A frame's patch centres. Past frames use the current geometry, if their camera has a current frame."""
     if frame.time != view.time:
         current = [f for f in frames if f.camera.names == frame.camera.names and f.time == view.time]
         if current:
-            points, valid = frame.lifted_by(current[0])
-    uv, valid = reproject(points, valid, view.camera)
-    s = torch.full_like(uv[:, :1], (view.time - frame.time) / config.window)
-    return torch.cat([uv, s], 1), valid
+            return frame.lifted_by(current[0])
+    return frame.points_world, frame.valid
 
 
 def _stack(positions: Sequence[Positions], length: int) -> TokenPositions:

@@ -149,4 +149,4 @@ def reproject(
     """
     uv, z = project(points_world, target)
     valid = valid & (z[0] > 1e-6)
-    return torch.where(valid[:, None], uv[0] / target.size_px[0], 0.0), valid
+    return uv[0] / target.size_px[0] * valid[:, None], valid

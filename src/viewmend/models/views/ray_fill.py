@@ -327,8 +327,8 @@ def multi_scale_context(
     # The cells of each size that pixels are in, the first of which begin `before` pixels outside the view
     sides = torch.stack([box_side_px(size, scale.subject_px) for size in CELLS])[:, None]
     middle = (view.camera if torch.compiler.is_exporting() else view.camera.on_host).K[0, :2, 2]
-    before = (-middle.floor().long().flip(0) % sides).to(pixels.device)
-    sides = sides.to(pixels.device)
+    before = -middle.floor().long().flip(0) % sides
+    before, sides = torch.cat([before, sides], 1).to(pixels.device).split((2, 1), 1)
     cells = (pixels[:, None] + before) // sides
     if torch.compiler.is_exporting():
         firsts, index = _first_pixels(cells, sides, before, view.mask.shape)

@@ -362,8 +362,8 @@ def _camera_features(
         is_source = is_source[chosen][:, None]
     is_source = is_source.expand_as(cosines)
     in_view = projected.in_view.float()[..., None]
-    saturation_m = behind.new_tensor([NEAR, FAR]) * rays.scale.size_m
-    differences = squash(behind[..., None] / saturation_m).float()
+    relative = [behind / (saturation * rays.scale.size_m) for saturation in (NEAR, FAR)]
+    differences = squash(torch.stack(relative, -1)).float()
     features = torch.cat([fine, differences, cosines[..., None], is_source[..., None], in_view, wide], -1)
     return features * in_view
 
@@ -456,7 +456,7 @@ def project_rays(rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] |
         start = start[chosen][:, None]
         size = size[chosen][:, None]
     z = rays.z_m[..., None]
-    projected = torch.addcmul(start, per_metre[:, None], z[..., None].double())
+    projected = torch.addcmul(start, per_metre[:, None], z[..., None])
     w = projected[..., 2]
     uv = projected[..., :2] / w.clamp_min(1e-6)[..., None]
     in_view = (z > 0) & (w > 1e-6) & ((uv >= 0) & (uv < size)).all(-1)
@@ -496,7 +496,7 @@ def viewing_cosines(
     camera, where c leads from the camera to the viewer. All samples of a ray share b b, b c and c c.
     """
     ray = rays.directions
-    z = rays.z_m.double()[..., None]
+    z = rays.z_m[..., None]
     to_viewer = rays.origin - _on_host(cameras).centers.double()
     c_and_square = torch.cat([to_viewer, to_viewer.square().sum(-1, keepdim=True)], 1).to(ray.device)
     b_c = ray @ c_and_square[:, :3].T
