@@ -65,11 +65,24 @@ def fill(rgb: Image, missing: Pixels, subject: Pixels) -> Image:
     included: at a silhouette they are half background. In wide holes only pixels of the `subject`
     count; farther than `REACH_PX` from any of these, holes are filled by `pull_push`.
     """
+    wide = wide_holes(missing)
+    return fill_wide(rgb, missing, subject, wide) if bool(wide.any()) else fill_thin(rgb, missing)
+
+
+def wide_holes(missing: Pixels) -> Pixels:
+    """The missing pixels that a square of `THIN_PX` of missing pixels contains."""
+    return missing & spread(~spread(~missing))
+
+
+def fill_thin(rgb: Image, missing: Pixels) -> Image:
+    """`fill` without wide holes: all missing pixels are within reach of known ones."""
+    return from_near(rgb, ~missing, missing)[0]
+
+
+def fill_wide(rgb: Image, missing: Pixels, subject: Pixels, wide: Pixels) -> Image:
+    """`fill` with wide holes."""
     known = ~missing
-    near, _ = from_near(rgb, known, missing)
-    wide = missing & spread(~spread(known))
-    if not bool(wide.any()):
-        return near  # then everything is within reach, too
+    near = fill_thin(rgb, missing)
     filled, reached = from_near(rgb, known & subject, missing)
     deep = missing & ~reached
     if bool(deep.any()):

@@ -134,6 +134,14 @@ def check_tensor(
     return value
 
 
+def nonzero_of(*masks: Tensor) -> list[Tensor]:
+    """`torch.nonzero` of each mask; waits for a GPU only once."""
+    if masks[0].device.type == "cpu":
+        return [torch.nonzero(mask) for mask in masks]
+    counts = torch.stack([mask.sum() for mask in masks]).tolist()
+    return [torch.nonzero_static(mask, size=count) for mask, count in zip(masks, counts, strict=True)]
+
+
 def extremes(images: Iterable[Tensor]) -> list[tuple[float, float]]:
     """The smallest and the largest number of each image, both NaN if any is; waits for a GPU only once."""
     found = torch.stack([extreme for image in images for extreme in image.detach().aminmax()])

@@ -85,6 +85,11 @@ def nearest_depth(depth: Float[Tensor, "*image height width"]) -> Float[Tensor, 
     return (nearest * (nearest < BEYOND_M)).view(*depth.shape[:-2], *nearest.shape[1:])
 
 
+def any_in_cell(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "rows columns"]:
+    """The cells that contain any of these pixels."""
+    return F.max_pool2d(pixels.float()[None], CELL_PX, ceil_mode=True)[0] > 0
+
+
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
     """The mean of each cell; of a cell that reaches beyond the image, the mean of the part inside."""
     return F.avg_pool2d(image, CELL_PX, ceil_mode=True)

@@ -44,6 +44,7 @@ from viewmend.models.views.grid import (
     LARGE_CELLS_FROM,
     Pixels,
     UNet,
+    any_in_cell,
     cell_means,
     concatenate_channels,
     crop_to,
@@ -68,6 +69,7 @@ from viewmend.models.views.sampler import Rays, RaySamples, RayStatistics, choos
 from viewmend.models.views.steadying import steady
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
+from viewmend.utils.tensors import nonzero_of
 
 Mask = Bool[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
@@ -220,13 +222,15 @@ class ViewSynthNet(Network):
         has_depth = with_rim.depth > 0
         predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
+        at_cells = with_rim, predicted, image
+        cell_px = CELL_PX
         if allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM:
-            half_view, half_predicted, half_image = halve(with_rim, predicted, image)
-            distribution = self._depth_distribution(half_view, sources, scale, half_predicted, half_image)
-            distribution = distribution._replace(cell_px=2 * CELL_PX)
-        else:
-            distribution = self._depth_distribution(with_rim, sources, scale, predicted, image)
-        return self._blend(with_rim, sources, scale, torch.nonzero(predicted), image, distribution)
+            at_cells = halve(with_rim, predicted, image)
+            cell_px = 2 * CELL_PX
+        pixels, cells = nonzero_of(predicted, any_in_cell(at_cells[1]))
+        distribution = self._depth_distribution(*at_cells, sources, scale, cells)
+        distribution = distribution._replace(cell_px=cell_px)
+        return self._blend(with_rim, sources, scale, pixels, image, distribution)
 
     @torch.no_grad()
     def fill_holes(
@@ -272,8 +276,8 @@ class ViewSynthNet(Network):
         with_rim = replace(view, depth=rim_depth(view.depth))
         predicted = with_rim.depth > 0
         image = ViewImage.of(view, filled, predicted)
-        distribution = self._depth_distribution(with_rim, sources, scale, predicted, image)
-        pixels = torch.nonzero(predicted)
+        pixels, cells = nonzero_of(predicted, any_in_cell(predicted))
+        distribution = self._depth_distribution(with_rim, predicted, image, sources, scale, cells)
         shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
         surface = surface_points(with_rim.depth, scale, pixels, distribution, shares)
         found = torch.stack([surface.depth, surface.probability], 1)
@@ -334,18 +338,18 @@ class ViewSynthNet(Network):
     def _depth_distribution(
         self,
         view: IncompleteView,
-        sources: SourceCameras,
-        scale: SceneScale,
         predicted: Mask,
         image: ViewImage,
+        sources: SourceCameras,
+        scale: SceneScale,
+        cells: Pixels,
     ) -> DepthDistribution:
-        """Samples the cameras on the rays of all cells, and scores the samples by a U-Net over the view.
+        """Samples the cameras on the rays of cells with a pixel to predict, and scores the samples by a U-Net.
 
         `view` has depth on the rim, too.
         """
-        # Cells with a pixel to predict, and the cameras and depth hypotheses of their rays
+        # The cameras and depth hypotheses of the cells' rays
         proxy_depth, whole_depth = nearest_depth(torch.stack([view.depth * predicted, view.depth]))
-        cells = torch.nonzero(proxy_depth > 0)
         rows, columns = cells.unbind(1)
         proxy_z = proxy_depth[rows, columns][:, None]
         uv_px = CELL_PX * (cells.flip(1).double() + 0.5)

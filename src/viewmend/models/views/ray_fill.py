@@ -17,7 +17,15 @@ from torch.nn import functional as F
 from viewmend.geometry.threads import all_threads, one_thread
 from viewmend.models.base import ContextProvider
 from viewmend.models.network import Network
-from viewmend.models.smooth_fill import MARGIN_PX, Fill, fill, pull_push
+from viewmend.models.smooth_fill import (
+    MARGIN_PX,
+    Fill,
+    fill,
+    fill_thin,
+    fill_wide,
+    pull_push,
+    wide_holes,
+)
 from viewmend.models.views.box_sums import BoxSums
 from viewmend.models.views.config import CONTRAST, RaysConfig
 from viewmend.models.views.grid import Pixels
@@ -33,6 +41,7 @@ from viewmend.models.views.sampler import (
 )
 from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
+from viewmend.utils.tensors import nonzero_of
 
 Image = Float[Tensor, "3 height width"]
 Features = Float[Tensor, "pixel point view 14"]
@@ -156,8 +165,12 @@ class RayFill(Network, Fill):
         `scale` is the view's, if it is known.
         """
         missing = view.error > 0
-        smooth = fill(view.rgb, missing, view.mask > 0)
-        pixels = torch.nonzero(missing & (view.depth > 0).any())
+        wide = wide_holes(missing)
+        pixels, of_wide = nonzero_of(missing & (view.depth > 0).any(), wide)
+        if len(of_wide):
+            smooth = fill_wide(view.rgb, missing, view.mask > 0, wide)
+        else:
+            smooth = fill_thin(view.rgb, missing)
         colours = self.mix(gather_ray_inputs(view, sources, pixels, smooth, scale))
         return smooth.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 
