@@ -22,10 +22,10 @@ SIZE_PX = 96
 FIRST = orbit([0.4], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 NEXT = orbit([0.5], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 CEILINGS = {
-    "telea": (355, 6, 7),
-    "rays": (865, 8, 17),
-    "views": (1660, 12, 46),
-    "paper-small": (850, 6, 18),
+    "telea": (300, 6, 7),
+    "rays": (565, 7, 17),
+    "views": (1160, 9, 43),
+    "paper-small": (598, 6, 17),
 }
 """Kernels, waits and copies of a second view of a frame, close to the first."""
 MIN_PSNR_DB = 100.0

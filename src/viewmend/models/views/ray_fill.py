@@ -166,12 +166,16 @@ class RayFill(Network, Fill):
         """
         missing = view.error > 0
         wide = wide_holes(missing)
-        pixels, of_wide = nonzero_of(missing & (view.depth > 0).any(), wide)
+        has_depth = view.depth > 0
+        pixels, of_wide, without_depth = nonzero_of(missing & has_depth.any(), wide, missing & ~has_depth)
         if len(of_wide):
             smooth = fill_wide(view.rgb, missing, view.mask > 0, wide)
         else:
             smooth = fill_thin(view.rgb, missing)
-        colours = self.mix(gather_ray_inputs(view, sources, pixels, smooth, scale))
+        inputs = gather_ray_inputs(
+            view, sources, pixels, smooth, scale, all_have_depth=not len(without_depth)
+        )
+        colours = self.mix(inputs)
         return smooth.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 
     def fill_view(self, view: IncompleteView, context: ContextProvider) -> Image:
@@ -275,10 +279,12 @@ def gather_ray_inputs(
     pixels: Pixels,
     smooth: Image | None = None,
     scale: SceneScale | None = None,
+    all_have_depth: bool = False,
 ) -> RayInputs:
     """The network's inputs for pixels (row, column) of a view.
 
     `smooth` is the image with E filled smoothly, and `scale` that of the view, if the caller has them.
+    `all_have_depth` says that all pixels are known to be on the proxy.
     """
     if smooth is None:
         smooth = fill(view.rgb, view.error > 0, view.mask > 0)
@@ -288,7 +294,7 @@ def gather_ray_inputs(
         features = view.depth.new_zeros(len(pixels), len(OFFSETS), 1, sum(CAMERA_CHANNELS))
         smallest = view.depth.new_ones(len(pixels), len(OFFSETS), 4)
     else:
-        samples = sample_behind_proxy(view, pixels, sources, scale=scale)
+        samples = sample_behind_proxy(view, pixels, sources, scale=scale, all_have_depth=all_have_depth)
         features = samples.features
         smallest = RayStatistics.unstack(samples.statistics).smallest_masks
     image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], smooth]), (RADIUS_PX,) * 4)
@@ -305,18 +311,19 @@ def sample_behind_proxy(
     sources: SourceCameras,
     offsets: Sequence[float] = OFFSETS,
     scale: SceneScale | None = None,
+    all_have_depth: bool = False,
 ) -> RaySamples:
     """`sample_fill_rays` at points `offsets` behind the proxy, on the rays of pixels (row, column).
 
     A pixel without a depth takes it from its surroundings; the view must have a depth somewhere.
-    `scale` is the view's, if it is known.
+    `scale` is the view's, if it is known, and `all_have_depth` says that no pixel lacks one.
     """
     if scale is None:
         scale = SceneScale.of(view)
     depth = view.depth[pixels[:, 0], pixels[:, 1]]
     if torch.compiler.is_exporting():
         depth = torch.where(depth > 0, depth, scale.depth_m)
-    elif not bool((depth > 0).all()):
+    elif not all_have_depth and not bool((depth > 0).all()):
         depth = pull_push(view.depth[None], view.depth > 0)[0][pixels[:, 0], pixels[:, 1]]
     z = depth[:, None] + scale.size_m * depth.new_tensor(offsets)
     return sample_fill_rays(Rays(view, scale, pixels.flip(1) + 0.5, z), sources)
