@@ -22,7 +22,7 @@ SIZE_PX = 96
 FIRST = orbit([0.4], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 NEXT = orbit([0.5], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 CEILINGS = {
-    "telea": (300, 6, 7),
+    "telea": (280, 6, 7),
     "rays": (565, 7, 17),
     "views": (1160, 9, 43),
     "paper-small": (598, 6, 17),
