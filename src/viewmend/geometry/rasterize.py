@@ -149,14 +149,12 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     edges = edge_functions(corners)
     determinant = (corners[..., 0, :] * edges[..., 0, :]).sum(-1)
     low, high = _pixel_boxes(corners, cameras.size_px)
-    keep = (low <= high).all(-1)
-    if cull:
-        keep = keep & (determinant * cull <= 0)
 
     # Every triangle of every view has a box of pixels. Only the total number of pixels is read from
     # the device. Edges become weights of the corners, which are 1/z at the corners' own pixels.
+    keep = (low <= high).all(-1) & (determinant * cull <= 0)
+    extent = ((high - low + 1) * keep[..., None]).flatten(0, 1)
     low = low.flatten(0, 1)
-    extent = ((high - low.view_as(high) + 1) * keep[..., None]).flatten(0, 1)
     weights = (edges / determinant[..., None, None]).flatten(0, 1)
     area = extent.prod(-1)
     ends = area.cumsum(0)
@@ -166,11 +164,10 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     for part, pixels in _portions(ends):
         box, uv = _candidate_pixels(low[part], extent[part], area[part], pixels)
         inverse, visible = _inverse_depth(weights[part][box], uv)
-        triangle = box + part.start
-        view = triangle // len(mesh.faces)
-        key = (inverse.view(torch.int32).long() << 32) | (LAST_FACE - triangle % len(mesh.faces))
-        pixel = (view * height + uv[:, 1]) * width + uv[:, 0]
-        keys.scatter_reduce_(0, pixel, key.masked_fill(~visible, EMPTY), "amax")
+        box = box + part.start
+        row = box // len(mesh.faces) * height + uv[:, 1]
+        key = (inverse.view(torch.int32).long() << 32) | (LAST_FACE - box % len(mesh.faces))
+        keys.scatter_reduce_(0, row * width + uv[:, 0], key.masked_fill(~visible, EMPTY), "amax")
 
     return _unpack_keys(keys.view(len(cameras), height, width))
 

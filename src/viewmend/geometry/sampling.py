@@ -16,7 +16,7 @@ class BilinearTaps(NamedTuple):
     row: Int[Tensor, "tap=4 view point"]
     """That of the nearest pixel at the border, if the image has no such pixel."""
     column: Int[Tensor, "tap=4 view point"]
-    """As `row`."""
+    """That of the nearest pixel at the border, as `row`."""
     weight: Float[Tensor, "tap=4 view point"]
     """The four weights sum to 1, also beyond the border of the image."""
 

@@ -42,7 +42,7 @@ def rope_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
 def rope_factors(
     coordinates: Float[Tensor, "*batch 3"], frequencies: Float[Tensor, "3 pair"]
 ) -> Float[Tensor, "2 *batch channel"]:
-    """By what `rotate` multiplies each channel, and the other channel of its pair, at these (u, v, s)."""
+    """The factors of each channel and of the other channel of its pair in `rotate`, at these (u, v, s)."""
     # A sum of products, not a matrix product: autocast would round the angles to bfloat16.
     angles = (coordinates[..., None] * frequencies).sum(-2)
     cos = angles.cos()

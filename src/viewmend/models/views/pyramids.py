@@ -75,7 +75,7 @@ class MipLevels(NamedTuple):
     pixels: Shaped[Tensor, "pixel channel"]
     """0 to 255, or metres."""
     layout: Int[Tensor, "*level view 5"]
-    """Where the pixels of each image are: `first`, `columns` and `last`."""
+    """The positions of each image's pixels: `first`, `columns` and `last`."""
     scale: Float[Tensor, "*level view"]
     """Factor from positions in the camera's image to positions in this one."""
 

@@ -325,7 +325,7 @@ def _sample_with_means(
 ) -> Sequence[Float[Tensor, "ray sample view channel"]]:
     """Images at the projections, and their means over boxes, divided by 255.
 
-    Each of `boxes` is a step and a side: every so many rows and columns are averaged over boxes of so many of them.
+    `boxes` are pairs of a step and a side, pixels: one row and column of each step counts, and a box has `side` of them.
     """
     if torch.compiler.is_exporting():  # the sides depend on the inputs
         found = [sample_level(MipLevels.full(images), projected, images.shape[1])]
