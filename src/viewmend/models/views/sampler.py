@@ -325,7 +325,7 @@ def _sample_with_means(
 ) -> Sequence[Float[Tensor, "ray sample view channel"]]:
     """Images at the projections, and their means over boxes, divided by 255.
 
-    `boxes` are pairs of a step and a side, pixels: one row and column of each step counts, and a box has `side` of them.
+    `boxes` are pairs of a step and a side, pixels: one row and column of each step counts; a box has `side` of these.
     """
     if torch.compiler.is_exporting():  # the sides depend on the inputs
         found = [sample_level(MipLevels.full(images), projected, images.shape[1])]
