@@ -165,9 +165,10 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
         box, uv = _candidate_pixels(low[part], extent[part], area[part], pixels)
         inverse, visible = _inverse_depth(weights[part][box], uv)
         box = box + part.start
-        row = box // len(mesh.faces) * height + uv[:, 1]
         key = (inverse.view(torch.int32).long() << 32) | (LAST_FACE - box % len(mesh.faces))
-        keys.scatter_reduce_(0, row * width + uv[:, 0], key.masked_fill(~visible, EMPTY), "amax")
+        key = key.masked_fill(~visible, EMPTY)
+        # box // len(mesh.faces) is the view
+        keys.scatter_reduce_(0, (box // len(mesh.faces) * height + uv[:, 1]) * width + uv[:, 0], key, "amax")
 
     return _unpack_keys(keys.view(len(cameras), height, width))
 

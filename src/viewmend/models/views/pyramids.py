@@ -47,9 +47,9 @@ class SceneScale:
             ordered = torch.where(covered, view.depth, torch.inf).flatten().sort().values
             median = ordered[((count - 1).clamp_min(0) // 2)]
             area = (view.mask > 0).sum()
-            size = _size_m(area, median, view.camera)
-            lengths_m = (torch.where(count > 0, value, 1.0) for value in (size, median))
-            return cls(*lengths_m, area.sqrt().double())
+            size_m = torch.where(count > 0, _size_m(area, median, view.camera), 1.0)
+            depth_m = torch.where(count > 0, median, 1.0)
+            return cls(size_m, depth_m, area.sqrt().double())
         area_px = (view.mask > 0).sum()
         median_m = torch.where(covered, view.depth, torch.nan).nanmedian()
         area, median = torch.stack([area_px.double(), median_m.double()]).cpu()  # one copy from the device

@@ -71,8 +71,8 @@ each time, which takes longer than the computation."""
 GPU_PIXELS_AT_ONCE = 8192
 """A chunk without gradients has this many pixels on a GPU, where memory is the limit."""
 PIXELS_STEP = 64
-"""On the CPU, layers run on multiples of this many pixels. PyTorch compiles and keeps convolutions and GELUs for each
-number of pixels; for all numbers, that would be slow, and fragment the memory of a server."""
+"""Layers run on multiples of this many pixels on the CPU. PyTorch compiles and keeps convolutions and GELUs
+for each number of pixels; for all numbers, that would be slow, and fragment the memory of a server."""
 
 
 class RayInputs(NamedTuple):
