@@ -65,6 +65,7 @@ class KeyMask:
     added: Float[Tensor, "sample 1 1 key"]
     """Added to scores: 0 for a key to keep, -inf for others; 0 for all keys of a sample that keeps none."""
     any_kept: Bool[Tensor, "sample 1 1 1"]
+    """Whether a sample keeps any key."""
 
     @classmethod
     def of(cls, keep: Bool[Tensor, "sample key"], dtype: torch.dtype) -> "KeyMask":
