@@ -32,7 +32,7 @@ import sys, time
 from pathlib import Path
 from viewmend.training.loop import join_processes
 with join_processes() as own:
-    if own.first:
+    if own.is_first:
         time.sleep(1)
         Path(sys.argv[2]).mkdir()
 assert Path(sys.argv[2]).is_dir()
