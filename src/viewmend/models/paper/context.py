@@ -122,12 +122,12 @@ def collate(
 
 def _carry(frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:
     """C_G(x) of the patches of all frames, one after the other."""
-    points, valid = (
-        torch.cat(parts) for parts in zip(*(_lift(f, frames, view) for f in frames), strict=True)
-    )
-    uv, valid = reproject(points, valid, view.camera)
-    s = [torch.full_like(f.uv_px[:, :1], (view.time - f.time) / config.window) for f in frames]
-    return torch.cat([uv, torch.cat(s)], 1), valid
+    lifted = [_lift(frame, frames, view) for frame in frames]
+    points = torch.cat([points for points, _ in lifted])
+    has_surface = torch.cat([valid for _, valid in lifted])
+    uv, in_front = reproject(points, has_surface, view.camera)
+    s = [torch.full_like(frame.uv_px[:, :1], (view.time - frame.time) / config.window) for frame in frames]
+    return torch.cat([uv, torch.cat(s)], 1), in_front
 
 
 def _lift(
