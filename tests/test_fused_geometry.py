@@ -1,5 +1,7 @@
 """Streams whose geometry is fused from predicted depth."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from reference.ball import camera_at, photograph, ring
@@ -8,7 +10,7 @@ from reference.forged import forged
 from viewmend.frame_cache import all_masks, cache_frame
 from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.fusion import FusionConfig
-from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.hull import HullConfig, visual_hull
 from viewmend.geometry.rasterize import rasterize
 from viewmend.models.base import DepthMap, Inpainter
 from viewmend.models.checkpoint import load_inpainter
@@ -67,7 +69,7 @@ def test_the_hull_follows_the_depth_that_is_predicted():
     target = camera_at(77, "novel", 96)
 
     def depth_m(model) -> float:
-        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), SMALL)
+        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), SMALL, HullConfig())
         return float(proxy.depth(target)[0, 48, 48])
 
     # Views from the side move the surface that faces the target by less than the full distance.
@@ -113,3 +115,16 @@ def test_completed_views_are_the_same_with_one_model_or_two(views):
     one.add_frame(frame)
     two.add_frame(frame)
     assert torch.equal(one.view(target).completed.rgb, two.view(target).completed.rgb)
+
+
+def test_the_hull_that_is_fused_has_the_streams_parameters(monkeypatch):
+    used = []
+
+    def carve(mask, cameras, bounds, config):
+        used.append(config)
+        return visual_hull(mask, cameras, bounds, config)
+
+    monkeypatch.setattr("viewmend.geometry.fusion.visual_hull", carve)
+    config = replace(FUSED, hull=HullConfig(pixels_per_voxel=4.0))
+    Stream(Moved(0.0), config).add_frame(photograph(ring(6, 96)))
+    assert used == [HullConfig(pixels_per_voxel=4.0, resolution=SMALL.resolution)]

@@ -632,3 +632,31 @@ def test_frames_of_the_window_are_dropped_last_and_once_with_a_warning(model, ca
     assert short.times == (3, 4)
     (record,) = caplog.records
     assert "raise StreamConfig.memory_mb" in record.getMessage() and "2 frames" in record.getMessage()
+
+
+def test_without_a_limit_frames_beyond_any_window_are_dropped_in_both_directions():
+    """An orbit may play a motion backwards."""
+    stream = Stream(Telea(), replace(CONFIG, memory_mb=None))
+    frame = photograph(SPARSE)
+    for time in (*range(0, 3 * WINDOW, 10), *reversed(range(0, 3 * WINDOW, 10))):
+        stream.add_frame(replace(frame, time=time), Sensors())
+        assert all(abs(other - time) <= WINDOW for other in stream.times)
+        assert time in stream.times
+
+
+def test_a_mask_is_predicted_whatever_the_view_attenuates():
+    shown = []
+
+    class Shown(Telea):
+        predicts_errors = True
+
+        def step(self, view, context, state):
+            shown.append(view.fade)
+            return super().step(view, context, state)
+
+    stream = Stream(Telea(), replace(CONFIG, predict_mask=True), error_model=Shown())
+    stream.add_frame(photograph(SPARSE))
+    view = stream.render(A)
+    expected = stream.predict_mask(view)
+    assert torch.equal(stream.predict_mask(replace(view, fade=0.9 * view.mask)), expected)
+    assert shown == [None, None]

@@ -181,14 +181,14 @@ def evict(
 
     First go the least recently used of those that the window at `time`, which reaches back
     `window_frames`, does not need; then the oldest of the window. Without a limit, all that are
-    more than `WINDOW` frames before `time` go.
+    more than `WINDOW` frames before or after `time` go.
 
     Returns:
         What was dropped of the window.
     """
     if memory_mb is None:
-        for old in [other for other in frames if other < time - WINDOW]:
-            del frames[old]
+        for far in [other for other in frames if abs(other - time) > WINDOW]:
+            del frames[far]
         return []
     window = range(time - window_frames, time)
     outside = [other for other in frames if other != time and other not in window]

@@ -9,6 +9,7 @@ from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
 from viewmend.geometry.fusion import DepthViews, FusionConfig, fuse_depth
+from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.virtual_cameras import surround
 from viewmend.models.base import ContextProvider, DepthMap, Inpainter, RenderQuality
@@ -22,7 +23,12 @@ LEAST_SIDE_PX = 16
 
 
 def fuse_geometry(
-    cached: CachedFrame, masks: Silhouettes, model: Inpainter, render: RenderConfig, config: FusionConfig
+    cached: CachedFrame,
+    masks: Silhouettes,
+    model: Inpainter,
+    render: RenderConfig,
+    config: FusionConfig,
+    hull_config: HullConfig,
 ) -> GeometryProxy:
     """The frame's hull, tightened by depth that the model predicts behind it.
 
@@ -32,6 +38,7 @@ def fuse_geometry(
         model: predicts depth (`Inpainter.predicts_depth`).
         render: how the views are rendered whose depth is predicted.
         config: parameters of the fusion.
+        hull_config: parameters of the hull, except its resolution, which is that of the fusion.
 
     Returns:
         The fused proxy; the hull itself if it is empty, or if no camera can be used.
@@ -56,7 +63,7 @@ def fuse_geometry(
             predicted.append(found)
     if not predicted:
         return hull
-    return fuse_depth(hull, masks.mask, masks.cameras, _stacked(predicted), config)
+    return fuse_depth(hull, masks.mask, masks.cameras, _stacked(predicted), config, hull_config)
 
 
 def _resized(camera: Cameras, bounds: Bounds, view_px: int) -> Cameras:

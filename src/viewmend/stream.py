@@ -75,7 +75,7 @@ class StreamConfig:
     """Frames are dropped above this much memory, MB: first those that the inpainter's temporal
     window does not need, the least recently used first. The default holds the window of
     `paper-small` for 8 cameras of 512 x 512 pixels, all of them encoded. None: frames are dropped
-    once no temporal window reaches back to them."""
+    that are further from the one in use than a temporal window reaches."""
 
     def __post_init__(self) -> None:
         if self.geometry not in get_args(Geometry):
@@ -244,7 +244,8 @@ class Stream:
         assert self._depth_model is not None
         start = now_s(images.rgb.device)
         masks = all_masks(images, carving)
-        proxy = fuse_geometry(hull, masks, self._depth_model, self.config.render, self.config.fusion)
+        config = self.config
+        proxy = fuse_geometry(hull, masks, self._depth_model, config.render, config.fusion, config.hull)
         fusion_ms = ms_since(start, images.rgb.device)
         # Encodings are dropped, because they depend on the hull's depth.
         return CachedFrame(images, to_mmap(proxy), hull.geometry_ms + fusion_ms)
@@ -372,7 +373,7 @@ class Stream:
                 "expected a stream that predicts masks, got one with predict_mask off; turn it on"
             )
         margin_px = model.crop_margin_px(RenderQuality())
-        view = replace(view, error=with_rim(view.mask))
+        view = replace(view, error=with_rim(view.mask), fade=None)
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         part = crop.of_view(view)
         context = self.context_provider(exclude=exclude)

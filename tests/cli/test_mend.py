@@ -17,7 +17,7 @@ from viewmend.cli import main, serve
 from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.native_writer import write_capture
-from viewmend.data.prepare import open_masked, prepare
+from viewmend.data.prepare import PreparedCapture, open_masked, prepare
 from viewmend.fused_geometry import fuse_geometry
 from viewmend.geometry.fusion import FusionConfig
 from viewmend.live.renderer import Renderer, RenderRequest
@@ -139,6 +139,27 @@ def test_frames_in_which_the_camera_left_out_is_absent_have_no_true_view(folder,
     assert [file.name for file in (tmp_path / "out/true").iterdir()] == ["000001.png"]
     with av.open(str(tmp_path / "out/compared.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 2
+
+
+def test_a_frame_with_one_usable_camera_is_skipped(folder, tmp_path, mend, monkeypatch):
+    read = PreparedCapture.read
+
+    def read_some(capture, time):
+        frame = read(capture, time)
+        return frame.select(("c0", *frame.cameras.names[6:])) if time in unusable else frame
+
+    monkeypatch.setattr(PreparedCapture, "read", read_some)
+    inputs = ("--no-align", "--frames", "0:2", "--cameras", *rig().names[:6])
+    unusable = {1}
+    for target in (("--leave-out", "held"), ("--path", "orbit:seconds=0.2")):
+        code, report, said = mend(folder, tmp_path / target[0], *target, *inputs)
+        assert code == 0 and report["frames"] < 4
+        assert "1 of 2 frames have fewer than two usable input cameras and were skipped" in said
+    unusable = {0, 1}
+    for target in (("--leave-out", "held"), ("--path", "orbit:seconds=0.2")):
+        code, _, said = mend(folder, tmp_path / "none", *target, *inputs)
+        assert code == 2 and "expected a frame with two usable input cameras, got none" in said
+        assert not (tmp_path / "none/rendered").exists()
 
 
 def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, mend):
@@ -271,7 +292,8 @@ def test_an_orbit_goes_around_the_subject_while_it_is_there(away, tmp_path, mend
 def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend, monkeypatch):
     small = FusionConfig(resolution=96, max_views=12, view_px=96)
     monkeypatch.setattr(
-        "viewmend.stream.fuse_geometry", lambda *arguments: fuse_geometry(*arguments[:-1], small)
+        "viewmend.stream.fuse_geometry",
+        lambda *arguments: fuse_geometry(*arguments[:-2], small, arguments[-1]),
     )
     reports = {}
     for geometry in ("hull", "fused"):

@@ -19,6 +19,7 @@ from viewmend.evaluation import scene_run
 from viewmend.evaluation.result_cache import CellStore, cell_keys
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
+from viewmend.evaluation.scores import Scorers
 from viewmend.models.classical import Telea
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import StreamConfig
@@ -235,3 +236,12 @@ def test_a_missing_cluster_is_one_clear_error(small_scenes, tmp_path, monkeypatc
     monkeypatch.setattr(cluster, "find_ray", lambda address: ray)
     with pytest.raises(ValueError, match=r"expected a Ray cluster at '127.0.0.1:1', got none .* --ray local"):
         run(small_scenes[:1], tmp_path, ray="127.0.0.1:1")
+
+
+def test_the_model_that_predicts_errors_has_the_runs_precision(monkeypatch):
+    asked = []
+    monkeypatch.setattr(scene_run, "error_model_for", lambda *arguments: asked.append(arguments[1:]))
+    stream = StreamConfig(render=RenderConfig(error_rule="predicted"), memory_mb=None)
+    settings = RunSettings(precision="float32", stream=stream)
+    scene_run._MethodStream("telea", settings, Scorers(), {})._make(None)
+    assert asked == [("cpu", "float32")]

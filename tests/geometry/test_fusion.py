@@ -12,7 +12,7 @@ from viewmend.geometry import fusion
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.fusion import DepthViews, FusionConfig, fuse_depth, fuse_occupancy
-from viewmend.geometry.hull import Cubes, OccupancyGrid, visual_hull
+from viewmend.geometry.hull import Cubes, HullConfig, OccupancyGrid, visual_hull
 from viewmend.geometry.mesh import vertex_normals
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.geometry.surface import extract_surface
@@ -20,6 +20,8 @@ from viewmend.geometry.surface import extract_surface
 BOX = Bounds(torch.full((3,), -0.6), torch.full((3,), 0.6))
 ABOVE = concatenate_cameras([camera_at(90 * n + 20, f"above{n}", 96, height_m=2.0) for n in range(4)])
 CONFIG = FusionConfig(resolution=48)
+FAR_AWAY = torch.eye(4)
+FAR_AWAY[:3, 3] = 100.0
 
 
 @pytest.fixture(params=["numba", "torch"])
@@ -176,3 +178,17 @@ def test_uncertain_depth_moves_the_hull_less_than_certain_depth():
 def test_a_config_without_meaning_is_refused(wrong):
     with pytest.raises(ValueError, match="expected"):
         FusionConfig(**wrong)
+
+
+def test_the_hull_is_carved_with_the_parameters_given():
+    cameras = ring(6, 48)
+    ball = proxy_of(lambda points: 0.5 - points.norm(dim=-1))
+    mask = (255 * (ball.depth(cameras) > 0)).byte()
+    views = true_views(ball, cameras)
+    assert len(fuse_depth(ball, mask, cameras, views, CONFIG).mesh.vertices)
+    behind = replace(ABOVE[[0]], camera_from_world=ABOVE.camera_from_world[:1] @ FAR_AWAY)
+    mask = torch.cat([mask, torch.zeros_like(mask[:1])])
+    cameras = concatenate_cameras([cameras, behind.resized(48, 48)])
+    all_must_see = HullConfig(min_fraction=1.0, least_fraction=1.0)
+    assert len(fuse_depth(ball, mask, cameras, views, CONFIG).mesh.vertices), "six of seven cameras see it"
+    assert not len(fuse_depth(ball, mask, cameras, views, CONFIG, all_must_see).mesh.vertices)

@@ -8,7 +8,7 @@ from reference.ball import camera_at, photograph, proxy, ring
 
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.mesh import Mesh
-from viewmend.rendering.view import RenderConfig, angles_to, render_view
+from viewmend.rendering.view import RenderConfig, angles_to, render_depth, render_view
 
 BALL = proxy()
 
@@ -80,3 +80,20 @@ def test_angles_are_measured_at_the_subject():
     )
     degrees = torch.rad2deg(angles_to(camera_at(10, "t"), cameras, CENTER))
     torch.testing.assert_close(degrees, torch.tensor([20.0, 90.0, 0.001]), atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_there_is_no_surface_where_depth_is_not_finite(value):
+    frame, target = photograph(ring(6)), camera_at(40, "t")
+    depth = BALL.depth(target)[0]
+    depth[20:24, 20:24] = 0.0
+    broken = depth.clone()
+    broken[20:24, 20:24] = value
+
+    def source_depth(names):
+        return BALL.depth(frame.cameras.select(names))
+
+    whole, _ = render_depth(frame, target, depth, source_depth, RenderConfig())
+    view, _ = render_depth(frame, target, broken, source_depth, RenderConfig())
+    for name in ("rgb", "mask", "error", "depth", "weights"):
+        assert torch.equal(getattr(view, name), getattr(whole, name)), name

@@ -31,6 +31,10 @@ a frame again."""
 LARGE_BUFFER_BYTES = 32_000_000
 """Larger buffers get their own memory mappings. 32 MB is the largest threshold that glibc chooses by itself;
 with the 8 MB of the live server, a video of 1080 x 1920 pixels takes a quarter longer."""
+NO_INPUTS = (
+    "expected a frame with two usable input cameras, got none; see the warnings, or choose other --frames"
+)
+"""The error message if no frame can be used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,6 +171,7 @@ def _mend_views(
     # Successive views of one frame share it, so it is read once.
     frames = prefetch(capture, [time for time, _ in groupby(plan_times)])
     frame = None
+    skipped: set[int] = set()
     trimmer = HeapTrimmer()
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
@@ -175,12 +180,22 @@ def _mend_views(
         for time, target in track(views, "inpainting", total=len(plan)):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
+            inputs = frame.without(held)
+            if len(inputs.cameras) < 2:  # preparation has left out cameras with unusable images or masks
+                skipped.add(time)
+                continue
             has_truth = any(name in frame.cameras.names for name in held)
             truth = frame.select(held) if has_truth else None
-            step = mender.mend(frame.without(held), target.to(options.device), truth)
+            step = mender.mend(inputs, target.to(options.device), truth)
             summary.add(step)
             output.add(step)
             trimmer.trim_if_due(idle=False)
+        if not summary.frames:
+            raise ValueError(f"{capture.name}: {NO_INPUTS}")
+    if skipped:
+        count = f"{len(skipped)} of {len(set(plan_times))} frames"
+        first = capture.frame_ids[min(skipped)]
+        say(f"{count} have fewer than two usable input cameras and were skipped; the first is '{first}'")
 
 
 def _report(
@@ -344,7 +359,10 @@ def _circle(
     for time in thinned(sorted(set(times))):
         frame = capture.read(time)
         assert frame.mask is not None, "captures without masks are refused"
-        points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
+        if len(frame.cameras) >= 2:
+            points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
+    if not points:
+        raise ValueError(f"{capture.name}: {NO_INPUTS}")
     extent = torch.cat(points)
     if not len(extent):
         raise ValueError(

@@ -273,7 +273,7 @@ def holes_line(table: Table) -> str:
         for of in ("hull", "image", "only_past")
     )
     past = (
-        f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past"
+        f"; source cameras saw {number(of_surface, 100, 2)} % of the missing surface only in the past"
         if of_surface
         else ""
     )

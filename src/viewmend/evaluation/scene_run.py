@@ -201,7 +201,9 @@ class _MethodStream:
             self._loaded[self.method] = make_method(self.method, settings.device, settings.precision)
         inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
-        error_model = error_model_for(inpainter, settings.device) if predicted else None
+        error_model = None
+        if predicted:
+            error_model = error_model_for(inpainter, settings.device, settings.precision)
         # Geometry and mask come with the frames, which all methods share.
         config = replace(settings.stream, geometry="hull", background=settings.background, predict_mask=False)
         quality = RenderQuality(top_k=settings.top_k)

@@ -7,7 +7,7 @@ where no view near it has depth, and moves less where depth is uncertain. Where 
 distances are also averaged over neighbouring voxels; otherwise the surface would be rough.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -88,6 +88,7 @@ def fuse_depth(
     cameras: Cameras,
     views: DepthViews,
     config: FusionConfig | None = None,
+    hull_config: HullConfig | None = None,
 ) -> GeometryProxy:
     """The hull of these masks, tightened by depth views, within the box of its proxy.
 
@@ -97,12 +98,14 @@ def fuse_depth(
         cameras: the masks' cameras.
         views: depth in real or virtual views.
         config: parameters of the fusion.
+        hull_config: parameters of the hull, except its resolution, which is that of the fusion.
 
     Raises:
         ValueError: there are masks of one camera only.
     """
     config = config or FusionConfig()
-    hull = visual_hull(mask, cameras, proxy.bounds, HullConfig(resolution=config.resolution))
+    at_resolution = replace(hull_config or HullConfig(), resolution=config.resolution)
+    hull = visual_hull(mask, cameras, proxy.bounds, at_resolution)
     fused = without_floating_parts(fuse_occupancy(hull, views, config), cameras)
     mesh = extract_surface(fused)
     return GeometryProxy(mesh, vertex_normals(mesh), proxy.bounds)

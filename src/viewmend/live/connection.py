@@ -298,8 +298,8 @@ class ViewerConnection:
         now = self._now()
         self._send_new_rig()
 
-        # Compute the state when its inputs have changed, or when it has to be repeated. With extensions, or with a
-        # clock that plays behind the live edge, it may change at any time, so compute it at every check.
+        # Compute the state when its inputs have changed, or when it has to be repeated. With extensions, or with
+        # a clock that plays behind the live edge, it may change at any time, so compute it at every check.
         # `_send_state` sends it if it is new.
         plays_behind = self._service.source.span.live and session.clock.playing and not session.clock.live
         changes_by_itself = bool(self._registry.extensions) or plays_behind
@@ -375,8 +375,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # Statistics cover the last second. They change when a frame is sent, and when one that the last
-        # message counted leaves that second. Both kinds of frames were sent after `stats_s - 1`.
+        # Statistics count the frames of the last second. So they change when a frame is sent, and when a frame
+        # in the last message becomes older than a second. All these frames were sent after `stats_s - 1`.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -318,8 +318,9 @@ class Renderer:
         stream = self._stream_of(None, left_out)
         cached = self._add_frame(stream, index, left_out)
         masks = all_masks(cached.frame)
-        render = self._config.render
-        proxy = fuse_geometry(cached, masks, self._depth_model, render, self._config.fusion)
+        config = self._config
+        render = config.render
+        proxy = fuse_geometry(cached, masks, self._depth_model, render, config.fusion, config.hull)
         if self._depth_model is self._inpainter:
             fused = Stream(self._inpainter, self._config, stream.bounds, self._error_model)
             fused.add_frame(cached.frame, geometry=proxy)

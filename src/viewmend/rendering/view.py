@@ -98,11 +98,13 @@ def render_depth(
 ) -> tuple[IncompleteView, Evidence]:
     """`render_view` for geometry that is known as depth maps: z-depth in metres, 0 where there is no surface.
 
-    `depth` is that of the surface in the novel view; `source_depth` returns its depth in the frame's cameras.
+    `depth` is that of the surface in the novel view, of 2 x 2 pixels or more; `source_depth` returns its
+    depth in the frame's cameras. Where `depth` is not finite, there is no surface.
 
     Raises:
         ValueError: there is no camera to colour the view.
     """
+    depth = torch.where(depth.isfinite(), depth, 0.0)
     uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device)
     points = unproject(uv_px.flatten(0, 1)[None], depth.flatten()[None], target)[0].view(*depth.shape, 3)
     across = torch.gradient(points, dim=1)[0]

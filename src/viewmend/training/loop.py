@@ -334,8 +334,8 @@ class Run:
                 self._save(step, clock)
             elif self.processes.is_first and not self.keeps_best:
                 self._write_model()  # the run was complete already, but its model may have been removed
-            # The last steps are validated, unless the loop has just done so. If their weights are the best,
-            # the checkpoint needs their score.
+            # Validate the last steps, unless the loop has just done so. They were saved first, because validation
+            # takes long. If their weights are the best, save again, because a checkpoint holds the best score.
             if step > first_step and config.validate_every and step % config.validate_every:
                 if self.validation is not None:
                     self._validate(log, step)
@@ -545,7 +545,7 @@ def _with_precision(config: TrainConfig, device: torch.device) -> TrainConfig:
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """The update rule of the averaged weights: each step moves them the share 1 - decay of the way to the weights.
+    """The update rule of the averaged weights: each step multiplies their difference from the weights by `decay`.
 
     They move faster in the first steps, so that the initial weights do not stay in the average.
     """

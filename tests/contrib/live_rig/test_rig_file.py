@@ -109,6 +109,11 @@ HEAD = 'calibration = "take"\n[mask]\nmethod = "plate"\n'
         (HEAD + ONE + ONE, "expected different names, got ['left'] more than once"),
         (HEAD + ONE + ONE.replace("left", "middle"), "cameras that"),
         (HEAD + ONE + ONE.replace("left", "right").replace("a.mp4", "ftp://x/y"), "expected a url of rtsp"),
+        (HEAD + ONE + ONE.replace("left", "right").replace("a.mp4", "RTSP://x/y"), "expected a url of rtsp"),
+        (
+            HEAD + ONE + ONE.replace("left", "right").replace("a.mp4", "crypto+http://x"),
+            "expected a url of rtsp",
+        ),
         (HEAD + ONE + ONE.replace("left", "right") + "options = {a = 1}", "options: expected a text, got "),
         (
             HEAD.replace("plate", "magic") + ONE + ONE.replace("left", "right"),

@@ -88,6 +88,18 @@ def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
         assert supply.read(supply.span.first - 1) is not None and supply.span.first > 0, "of the other rig"
 
 
+def test_a_rig_outlives_files_that_are_being_replaced(rig, caplog, monkeypatch):
+    supply = RigFileSource(rig, align=False)
+
+    def vanish(*_):
+        raise FileNotFoundError("images.bin has just been moved")
+
+    monkeypatch.setattr("viewmend.contrib.live_rig.rig_source.read_rig", vanish)
+    supply._stamp = None
+    supply._reload_if_changed()
+    assert "the rig stays as it was: images.bin has just been moved" in caplog.text
+
+
 def test_recordings_that_do_not_overlap_are_an_error_of_the_rig(rig, monkeypatch):
     def apart(_):
         raise ValueError("expected recordings that overlap in time, got none")

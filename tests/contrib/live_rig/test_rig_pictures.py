@@ -102,6 +102,33 @@ def test_recordings_are_played_by_their_timecodes_and_this_is_said():
     assert said is not None and "0.30 s apart (first 'a', last 'b'); they are matched by timecode" in said
 
 
+def test_a_recording_follows_when_another_one_changes_the_timeline(camera, clock, playback):
+    """A shorter recording is added: laps get shorter, and a reader that joins now is where this one is."""
+    with closing(read_images(camera, Counter(), playback, clock.wait)) as played:
+        for _ in range(11):  # the second lap begins with the ninth
+            next(played)
+        playback.length_s = 6 / FPS
+        with closing(read_images(camera, Counter(), playback, clock.wait)) as joined:
+            for _ in range(12):
+                own = next(played)
+                clock.now = own.taken_s
+                other = next(joined)
+                assert own.taken_s == pytest.approx(other.taken_s)
+                assert shade(own.frame) == shade(other.frame)
+
+
+def test_a_recording_follows_when_its_own_shift_changes(camera, clock, playback):
+    playback.shifts_s = {camera.name: 0.3}
+    with closing(read_images(camera, Counter(), playback, clock.wait)) as played:
+        assert next(played).taken_s == pytest.approx(1000.3)
+        playback.shifts_s = {camera.name: 0.0}
+        image = next(played)
+        assert image.taken_s == pytest.approx(1000.4)
+    with closing(read_images(camera, Counter(), playback, clock.wait)) as joined:
+        clock.now = 1000.4
+        assert shade(next(joined).frame) == shade(image.frame)
+
+
 def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
     frames = [picture(number) for number in range(3)]
     upright = write_film(tmp_path / "a.mp4", frames)

@@ -84,6 +84,29 @@ def test_pictures_of_another_size_are_refused_and_said(camera):
     assert worker.counts["refused"] == 3 and worker.error == expected
 
 
+def test_a_mask_that_fails_costs_one_picture(camera):
+    delivered = threading.Event()
+
+    class Masks:
+        images = 0
+
+        def mask(self, rgb):
+            self.images += 1
+            if self.images == 1:
+                raise RuntimeError("out of memory")
+            return np.zeros(rgb.shape[:2], np.uint8)
+
+    def connect(worker):
+        yield DecodedImage(frame(), 0.0)
+        wait_until(lambda: worker.counts["refused"] == 1)
+        yield DecodedImage(frame(), 1.0)
+        worker.wait(WAIT_S)
+
+    with working(camera, connect, lambda *_: delivered.set(), _masks=Masks()) as worker:
+        assert delivered.wait(WAIT_S)
+    assert worker.counts["refused"] == 1 and worker.error == "out of memory"
+
+
 def test_a_slow_mask_costs_pictures_and_never_delay(camera):
     delivered, go_on = [], threading.Event()
 

@@ -20,7 +20,8 @@ images from their tick."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""The largest number of complete groups that wait to be taken; the oldest are dropped."""
+"""This many groups may wait to be taken, in addition to those that may still wait for images. If there are more,
+the oldest are dropped."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,7 +16,14 @@ from viewmend.contrib.live_rig.frame_times import frame_times
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.errors import CaptureError
 from viewmend.data.video_clock import Track, match_tracks
-from viewmend.data.videos import decode, first_field_alone, first_field_of, to_rgb, video_properties
+from viewmend.data.videos import (
+    VideoProperties,
+    decode,
+    first_field_alone,
+    first_field_of,
+    to_rgb,
+    video_properties,
+)
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -60,6 +67,15 @@ class DecodedImage:
         return to_rgb(first_field_alone(self.frame, self.first_field), size_px)
 
 
+class Timing(NamedTuple):
+    """How one recording is played on the timeline."""
+
+    lap_s: float
+    """See `Playback.length_s`."""
+    shift_s: float
+    """Seconds to add to the recording's times, which gives times on the timeline."""
+
+
 class Playback:
     """The common timeline on which recordings are played in a loop, as if they were live."""
 
@@ -89,6 +105,10 @@ class Playback:
             shift_s = float(shifted.times_s[0] - original.times_s[0])
             self.shifts_s[original.camera] = shift_s - first_s
         return clock.timecode_note
+
+    def timing(self, name: str, first_s: float) -> Timing:
+        """How a recording is played now, given the time of its first image."""
+        return Timing(self.length_s, self.shifts_s.get(name, -first_s))
 
     def lap_start_s(self, now_s: float) -> float:
         """When the current lap began."""
@@ -149,13 +169,23 @@ def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Dec
 def _play_recording(
     camera: LiveCamera, playback: Playback, wait: Callable[[float], bool]
 ) -> Generator[DecodedImage, None, None]:
-    """A recording's images when they are due, lap after lap; overdue ones are skipped."""
+    """A recording's images when they are due; overdue ones are skipped."""
     try:
         video = video_properties(Path(camera.url))
     except CaptureError as error:
         raise OSError(str(error)) from None
-    shift_s = playback.shifts_s.get(camera.name, -video.times_s[0])
-    times_s = [time_s + shift_s for time_s in video.times_s]
+    has_to_end = False
+    while not has_to_end:
+        has_to_end = yield from _play_laps(camera, video, playback, wait)
+
+
+def _play_laps(
+    camera: LiveCamera, video: VideoProperties, playback: Playback, wait: Callable[[float], bool]
+) -> Generator[DecodedImage, None, bool]:
+    """A recording's images, lap after lap, until its timing changes. Returns True if `wait` says that it has to end."""
+    first_s = video.times_s[0]
+    timing = playback.timing(camera.name, first_s)
+    times_s = [time_s + timing.shift_s for time_s in video.times_s]
 
     # The first lap begins where the other recordings are now, later laps at position 0.
     now_s = time.monotonic()
@@ -163,20 +193,24 @@ def _play_recording(
     position_s = now_s - lap_start_s
     while True:
         for index, frame in decode(video, bisect_left(times_s, position_s - ROUNDING_S), threads=1):
-            if times_s[index] >= playback.length_s - ROUNDING_S:
+            if times_s[index] >= timing.lap_s - ROUNDING_S:
                 break
             due_s = lap_start_s + times_s[index]
             if due_s < time.monotonic() - LATE_S:
                 continue
             if wait(due_s - time.monotonic()):
-                return
+                return True
+            if playback.timing(camera.name, first_s) != timing:
+                return False
             yield DecodedImage(frame, due_s - camera.offset_s)
 
         # Begin the next lap. If this recording has fallen behind, join the lap that the others are in.
-        lap_start_s = max(lap_start_s + playback.length_s, playback.lap_start_s(time.monotonic()))
+        lap_start_s = max(lap_start_s + timing.lap_s, playback.lap_start_s(time.monotonic()))
         position_s = 0.0
         if wait(lap_start_s - time.monotonic()):
-            return
+            return True
+        if playback.timing(camera.name, first_s) != timing:
+            return False
 
 
 def _open_stream(camera: LiveCamera) -> "InputContainer":

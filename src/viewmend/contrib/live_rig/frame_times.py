@@ -57,8 +57,8 @@ class SenderTimes(ImageTimes):
         self._clock = SenderClock()
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last `lag_packets + 1` packets; None for those it did not wait for. As
-        FFmpeg lags by `lag_packets`, the newest packet's data arrived at the first of these times."""
+        """When the reader received the last `lag_packets + 1` packets; None for those it did not wait for. The
+        newest packet's data arrived at the first of these times: FFmpeg held it for `lag_packets` more."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

@@ -51,8 +51,8 @@ class RigCameraEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     offset_ms: Annotated[float, Meta(ge=-10_000, le=10_000)] = 0.0
 
     def __post_init__(self) -> None:
-        scheme = re.match(r"([a-z]+)://", self.url)
-        if scheme and scheme[1] not in SCHEMES:
+        scheme, separator, _ = self.url.partition("://")
+        if separator and scheme not in SCHEMES:
             known = ", ".join(SCHEMES)
             raise ValueError(
                 f"expected a url of {known}, a device or a file, got '{self.url[:80]}'; choose one"
@@ -177,8 +177,8 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file():
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # A recognised file other than `path`, with the same suffix, is another calibration. With another suffix,
-    # `path` is taken to belong to it.
+    # A calibration may consist of several files. A file with the suffix of the recognised one may also be another
+    # calibration, so it is refused unless the format is given.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

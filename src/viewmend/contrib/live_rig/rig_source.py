@@ -264,15 +264,15 @@ class RigFileSource(LiveSource):
                 self._cameras_lock.notify()
 
     def _reload_if_changed(self) -> None:
-        """Reload the rig file if it has changed; an invalid file is reported and ignored."""
+        """Reload the rig file if it has changed; a file that cannot be used is reported and ignored."""
         stamp = FileStamp.of(self._path)
         if stamp == self._stamp:
             return
         self._stamp = stamp
         try:
             self._switch_to(read_rig(self._path, self._max_image_size))
-        except ValueError as error:
-            log.warning("the rig stays as it was: %s", error)
+        except Exception as error:  # the thread goes on, whatever happens while files are being replaced
+            log.warning("the rig stays as it was: %s", str(error) or type(error).__name__)
             return
         self._begin_rig()
         log.warning(

@@ -179,12 +179,13 @@ class CameraWorker:
         while not self._stopped.is_set():
             try:
                 decoded = self._newest.get(timeout=POLL_S)
-                images = self._process(decoded)
             except Empty:
                 continue
-            except ValueError as error:
+            try:
+                images = self._process(decoded)
+            except Exception as error:  # after any failure, the worker goes on with the next image
                 self.counts["refused"] += 1
-                self._report(str(error))
+                self._report(str(error) or type(error).__name__)
                 continue
             self._deliver(self.camera.name, decoded.taken_s, images)
 

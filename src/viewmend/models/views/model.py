@@ -222,14 +222,15 @@ class ViewSynthNet(Network):
         has_depth = with_rim.depth > 0
         predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
-        at_cells = with_rim, predicted, image
-        cell_px = CELL_PX
-        if allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM:
-            at_cells = halve(with_rim, predicted, image)
-            cell_px = 2 * CELL_PX
-        pixels, cells = nonzero_of(predicted, any_in_cell(at_cells[1]))
-        distribution = self._depth_distribution(*at_cells, sources, scale, cells)
-        distribution = distribution._replace(cell_px=cell_px)
+
+        # The depth distribution, in cells of `CELL_PX` pixels of the view or, for large cells, of half the view
+        large_cells = allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM
+        cell_inputs = halve(with_rim, predicted, image) if large_cells else (with_rim, predicted, image)
+        cell_view, cell_predicted, cell_image = cell_inputs
+        pixels, cells = nonzero_of(predicted, any_in_cell(cell_predicted))
+        distribution = self._depth_distribution(cell_view, cell_predicted, cell_image, sources, scale, cells)
+        if large_cells:
+            distribution = distribution._replace(cell_px=2 * CELL_PX)
         return self._blend(with_rim, sources, scale, pixels, image, distribution)
 
     @torch.no_grad()
