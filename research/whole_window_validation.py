@@ -52,8 +52,8 @@ class Options:
     top_k: tuple[int, ...] = ()
     """Numbers of context tokens to keep; 0 keeps all. Without it, each model's own number."""
     present: bool = False
-    """Also score each model with the cameras of the present frame alone."""
-    scenes: int = 16
+    """Also score each model with the cameras of the present frame alone, and the first --top-k."""
+    scenes: int = 12
     """Scenes to score."""
     holdout_views: int = 3
     """Views of a scene at most."""
@@ -187,14 +187,15 @@ def main(options: Options) -> None:
     print("| variant | holes | difference from the first | better in | processor s of a view |")
     print("| --- | --- | --- | --- | --- |")
     reference: tuple[float, ...] | None = None
-    contexts = (False, True) if options.present else (False,)
+    tokens = options.top_k or (None,)
     for name in options.weights:
         model = load_network(name)
         if not isinstance(model, PatchTransformer):
             raise ValueError(
                 f"expected a model of the paper, got {name}; name paper-small or the folder of a run"
             )
-        variants = [Variant(name, k, present) for present in contexts for k in options.top_k or (None,)]
+        variants = [Variant(name, k, present=False) for k in tokens]
+        variants += [Variant(name, tokens[0], present=True)] if options.present else []
         scored = score(model, variants, scenes)
         for variant, own in zip(variants, scored, strict=True):
             reference = reference or own.by_scene
