@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from reference.ball_rig import rig_text
+from reference.foreign_studios import write_riftcast
+from reference.random_rigs import named, random_rig
 
-from viewmend.contrib.live_rig.rig_file import read_rig
+from viewmend.contrib.live_rig.rig_file import MAX_BYTES, read_rig
 from viewmend.contrib.live_rig.worker import mask_maker
 from viewmend.data.errors import CaptureError
 
@@ -85,6 +87,18 @@ def test_the_calibration_may_be_named_by_its_file(folder):
     assert len(rig.cameras) == 2
 
 
+def test_the_calibration_may_be_a_file_that_stands_for_a_capture(folder):
+    """RIFTCast's meta file may lie outside of the data set's folder."""
+    cameras = named(random_rig(3, 2, 0), "{}")
+    meta = {"type": "VCI", "version": "2.1.0", "dataset": {"path": "data"}, "volume": {"position": [0, 0, 0]}}
+    write_riftcast(folder / "data", cameras, ["00001"])
+    (folder / "start.json").write_text(json.dumps(meta))
+    for format in (None, '"riftcast"'):
+        names = [camera["name"] for camera in cameras]
+        rig = read(folder, rig_text(names, calibration='"start.json"', format=format))
+        assert rig.bounds_m.tolist() == [[-1, -1, -1], [1, 1, 1]]
+
+
 def test_masks_are_made_by_the_person_network_unless_the_file_says_otherwise(folder):
     cameras = "".join(f'[[cameras]]\nname = "{name}"\nurl = "{name}.mp4"\n' for name in NAMES)
     assert {camera.mask.method for camera in read(folder, f'calibration = "take"\n{cameras}').cameras} == {
@@ -101,6 +115,8 @@ HEAD = 'calibration = "take"\n[mask]\nmethod = "plate"\n'
     [
         ("calibration = take", "Invalid value"),
         ("\xff", "rig.toml: "),
+        ("a = " + 9999 * "[", "brackets that are nested too deeply"),
+        (rig_text(NAMES) + "#" * MAX_BYTES, "expected rig.toml to have at most 1000000 bytes, got more"),
         (rig_text(NAMES, calibration=None), "calibration: expected a value, got nothing; add the key"),
         (rig_text(NAMES, fps="0"), "fps: "),
         (rig_text(NAMES, fps='"15"'), 'fps: expected a number, got "15"'),

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -14,7 +15,9 @@ from reference.ball import photograph
 from reference.ball_rig import CAMERAS, make_rig, rig_text
 
 from viewmend.cli import main
+from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.rig_source import RigFileSource
+from viewmend.data.camera_images import CameraImages
 from viewmend.data.errors import CaptureError
 from viewmend.live.client import Publisher
 
@@ -98,6 +101,22 @@ def test_a_rig_outlives_files_that_are_being_replaced(rig, caplog, monkeypatch):
     supply._stamp = None
     supply._reload_if_changed()
     assert "the rig stays as it was: images.bin has just been moved" in caplog.text
+
+
+def test_a_camera_that_was_replaced_delivers_nothing_more(rig):
+    """Its last image may be masked while the rig changes; the new calibration is not that image's."""
+    supply = RigFileSource(rig, align=False)
+    before = supply._workers["c0"]
+    rig.write_text(rig_text().replace('video/c0.mp4"', 'video/c0.mp4"\noffset_ms = 5'))
+    supply._switch_to(read_rig(rig))
+    after = supply._workers["c0"]
+    assert after is not before
+    images = CameraImages(np.zeros((48, 48, 3), np.uint8), np.zeros((48, 48), np.uint8), depth=None)
+    taken_s = time.monotonic()
+    supply._add_image(before, taken_s, images)
+    assert supply._aligner.take(taken_s + 60) == []
+    supply._add_image(after, taken_s, images)
+    assert len(supply._aligner.take(taken_s + 60)) == 1
 
 
 def test_recordings_that_do_not_overlap_are_an_error_of_the_rig(rig, monkeypatch):

@@ -11,12 +11,12 @@ from jaxtyping import Float64
 from msgspec import Meta, Struct
 
 from viewmend.data.errors import CaptureError
-from viewmend.data.formats import read_any_calibration
+from viewmend.data.formats import is_capture_file, read_any_calibration
 from viewmend.data.native_format import NativeCalibration, NativeCamera
-from viewmend.utils.untrusted_input import one_of, typed
+from viewmend.utils.untrusted_input import bounded_bytes, one_of, typed
 
 MAX_BYTES = 1_000_000
-"""A rig's file is read up to this many bytes."""
+"""A rig's file has at most this many bytes."""
 SCHEMES = ("rtsp", "rtsps", "rtp", "http", "https", "udp", "tcp", "srt")
 """Schemes of cameras' addresses; what has no scheme is a file or a device."""
 DEVICE = re.compile(r"/dev/video\d+|/dev/v4l/.+")
@@ -136,16 +136,17 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
     """
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES)
-        rig: RigFile = typed(tomllib.loads(text.decode()), RigFile)
+        text = bounded_bytes(path, MAX_BYTES).decode()
+        rig: RigFile = typed(tomllib.loads(text), RigFile)
     except OSError as error:
         raise CaptureError(
             f"{path}: expected a rig's TOML file, got: {error.strerror}; check the path"
         ) from None
     except UnicodeError as error:
         raise CaptureError(f"{path}: expected TOML, got something else: {error}") from None
-    except ValueError as error:  # wrong TOML, or a wrong key or value
+    except RecursionError:
+        raise CaptureError(f"{path}: expected TOML, got brackets that are nested too deeply") from None
+    except ValueError as error:  # wrong TOML, a wrong key or value, or too large a file
         raise CaptureError(f"{path}: {str(error).rstrip('.')}") from None
     folder = path.resolve().parent
     calibration = _calibration(folder / rig.calibration, rig.format)
@@ -169,12 +170,12 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
 
 
 def _calibration(path: Path, format: str | None) -> NativeCalibration:
-    """The calibration in a folder of any format, or in a file of such a folder.
+    """The calibration in a folder of any format, in a file of such a folder, or in a file that stands for a capture.
 
     Raises:
         CaptureError: there is none, or the calibration recognised in the folder is another file.
     """
-    if not path.is_file():
+    if not path.is_file() or is_capture_file(path, format):
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
     # A calibration may consist of several files. A file with the suffix of the recognised one may also be another

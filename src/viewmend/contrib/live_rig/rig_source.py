@@ -256,10 +256,11 @@ class RigFileSource(LiveSource):
             log.warning("%s", change)
         return prepared
 
-    def _add_image(self, name: str, taken_s: float, images: CameraImages) -> None:
+    def _add_image(self, worker: CameraWorker, taken_s: float, images: CameraImages) -> None:
         """Add a camera's image and mask to the aligner. Called on the threads of the cameras' workers."""
+        name = worker.camera.name
         with self._cameras_lock:
-            if name in self._aligner.counts:  # otherwise the camera has just been removed from the rig
+            if self._workers.get(name) is worker:  # otherwise the camera has just been removed or replaced
                 self._aligner.put(name, TimedImages(taken_s, images), time.monotonic())
                 self._cameras_lock.notify()
 

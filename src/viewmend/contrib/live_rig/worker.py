@@ -78,7 +78,7 @@ class CameraWorker:
         self,
         camera: LiveCamera,
         connect: Callable[["CameraWorker"], Generator[DecodedImage, None, None]],
-        deliver: Callable[[str, float, CameraImages], None],
+        deliver: Callable[["CameraWorker", float, CameraImages], None],
         wants: Callable[[float, float], bool],
     ) -> None:
         """Set up; the threads are started by `start`.
@@ -86,7 +86,7 @@ class CameraWorker:
         Args:
             camera: the camera.
             connect: connects to the camera, and generates its images until it fails.
-            deliver: called with the camera's name, the time at which an image was taken, and the image.
+            deliver: called with this worker, the time at which an image was taken, and the image.
             wants: returns whether an image is used; called with the time at which it was taken and the
                 camera's average time between two images.
 
@@ -187,7 +187,7 @@ class CameraWorker:
                 self.counts["refused"] += 1
                 self._report(str(error) or type(error).__name__)
                 continue
-            self._deliver(self.camera.name, decoded.taken_s, images)
+            self._deliver(self, decoded.taken_s, images)
 
     def _process(self, decoded: DecodedImage) -> CameraImages:
         """The reduced and undistorted image with its mask; ValueError if its size is not the calibration's."""

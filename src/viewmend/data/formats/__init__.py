@@ -55,6 +55,12 @@ FORMAT_NAMES = ("plain", *FORMATS)
 """The names of all formats; ours is `plain`."""
 
 
+def is_capture_file(path: Path, format: str | None = None) -> bool:
+    """Whether a file stands for a capture by itself, as those of DNA-Rendering and RIFTCast's meta files do."""
+    names = [name for name in FORMATS if format in (None, name)]
+    return path.is_file() and any(FORMATS[name].find(path) is not None for name in names)
+
+
 def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
     """The first of these formats that matches, and the file that identifies it; "" and None if none does."""
     for name in names:
