@@ -9,7 +9,7 @@ from reference.capture_folder import remove_masks
 
 from viewmend.cli import main
 from viewmend.cli.checks import chosen_times
-from viewmend.data.capture_folder import open_capture
+from viewmend.data.capture_folder import CaptureFolder, open_capture
 from viewmend.data.prepare import adjustments
 
 AS_IT_IS = ("--no-align", "--no-match-colours")
@@ -30,10 +30,12 @@ POSES = [torch.eye(4).tolist()]
             json.dumps({"world_from_camera": POSES, "width": 10**8, "height": 9}),
             "expected a whole number <= 16384",
         ),
+        (json.dumps({"world_from_camera": POSES, "width": 9, "height": 1}), "expected a whole number >= 2"),
         ("[" * 100_000, "expected JSON"),
     ],
 )
-def test_a_bad_path_is_named(folder, tmp_path, mend, content, message):
+def test_a_bad_path_is_named_before_frames_are_read(folder, tmp_path, mend, monkeypatch, content, message):
+    monkeypatch.setattr(CaptureFolder, "read", lambda *_: pytest.fail("a frame was read"))
     file = tmp_path / "path.json"
     file.write_text(content)
     code, _, err = mend(folder, tmp_path / "out", "--path", file, *AS_IT_IS)

@@ -192,3 +192,18 @@ def test_the_hull_is_carved_with_the_parameters_given():
     all_must_see = HullConfig(min_fraction=1.0, least_fraction=1.0)
     assert len(fuse_depth(ball, mask, cameras, views, CONFIG).mesh.vertices), "six of seven cameras see it"
     assert not len(fuse_depth(ball, mask, cameras, views, CONFIG, all_must_see).mesh.vertices)
+
+
+@pytest.mark.parametrize("field", ["depth", "confidence"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_view_says_nothing_where_its_values_are_not_finite(fuse, field, value):
+    ball = proxy_of(lambda points: 0.5 - points.norm(dim=-1))
+    cameras = ring(6, 48)
+    mask = (255 * (ball.depth(cameras) > 0)).byte()
+    hull = visual_hull(mask, cameras, BOX, HullConfig(resolution=32))
+    views = true_views(ball, cameras)
+    broken = getattr(views, field).clone()
+    broken[:3] = value
+    nothing = torch.cat([torch.zeros_like(views.depth[:3]), views.depth[3:]])
+    expected = fuse(hull, replace(views, depth=nothing), CONFIG)
+    assert torch.equal(fuse(hull, replace(views, **{field: broken}), CONFIG), expected)

@@ -129,13 +129,15 @@ def run(options: Options) -> int:
 
     configure_allocator(LARGE_BUFFER_BYTES)
 
-    # Open and prepare the capture. Options are checked before anything is read.
+    # Open and prepare the capture. Options, and a file of poses, are checked before any frame is read.
     render = options.view.config()
     turntable = parse_turntable(options.path or "")
     held = options.held
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
     usable = _find_usable_frames(opened, times, held)
+    if options.path is not None and turntable is None:
+        _read_poses(options, opened, times)
     inpainter = load_named(options.model, options.device, options.precision)
     protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
@@ -332,15 +334,24 @@ def _plan(
     options: Options, capture: "CaptureSource", times: range, usable: list[int], turntable: "Turntable | None"
 ) -> "list[tuple[int, Cameras]]":
     """The frame and the camera of each view, in order; without views of frames that are not usable."""
-    from viewmend.data.camera_path import pair_with_frames, read_camera_path
-    from viewmend.data.capture_folder import origin_of
-
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in usable]
     if turntable is not None:
         return _circle(turntable, capture, usable)
+    return [(time, pose) for time, pose in _read_poses(options, capture, times) if time in usable]
+
+
+def _read_poses(options: Options, capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
+    """The frames with the poses in the file of --path.
+
+    Raises:
+        ValueError: the file has other content, or another number of poses.
+    """
+    from viewmend.data.camera_path import pair_with_frames, read_camera_path
+    from viewmend.data.capture_folder import origin_of
+
     path = read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture))
-    return [(time, pose) for time, pose in pair_with_frames(path, times) if time in usable]
+    return pair_with_frames(path, times)
 
 
 def _circle(

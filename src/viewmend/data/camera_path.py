@@ -15,7 +15,7 @@ from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, one_of
 
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
-Pixels = Annotated[int, Meta(ge=1, le=16384)]
+Pixels = Annotated[int, Meta(ge=2, le=16384)]
 
 STATIC_VIEWS = 60
 """A turntable has at least this many views by default."""

@@ -116,8 +116,12 @@ def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig)
 
     Each view that sees a voxel adds its signed distance to the surface along the axis of
     its camera, weighted by the confidence. `config.truncation_voxels` limits distances in
-    front of the surface; a view says nothing about voxels that are farther behind it.
+    front of the surface; a view says nothing about voxels that are farther behind it. Nor does it
+    where its depth or its confidence is not finite.
     """
+    is_finite = views.depth.isfinite() & views.confidence.isfinite()
+    depth = torch.where(is_finite, views.depth, 0.0)
+    views = DepthViews(views.cameras, depth, torch.where(is_finite, views.confidence, 0.0))
     on_cpu = hull.values.device.type == "cpu"
     add_up = _sums_numba if on_cpu else _sums_torch
     take_vote = _vote_numba if on_cpu else _vote_torch
