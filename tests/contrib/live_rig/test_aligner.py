@@ -133,3 +133,34 @@ def test_a_slower_rig_takes_each_cameras_picture_at_its_ticks():
     for phase_s in (0.0, 0.02):
         assert [n for n in range(40) if rig.wants(n * FRAME_S + phase_s, FRAME_S)] == list(range(0, 40, 2))
     assert all(rig.wants(n * 0.2 + 0.05, 2 * FRAME_S) for n in range(40))
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "period_s"),
+    [
+        (0.2, 0.1),
+        (0.5, 0.1),
+        (0.5, 0.5),
+        (1.0, 0.1),
+        (1.0, 1.0),
+        (2.0, 0.1),
+        (2.0, 1.0),
+        (2.0, 2.0),
+        (10.0, 0.1),
+    ],
+)
+def test_a_slow_rig_waits_for_its_cameras(interval_s, period_s):
+    """Its images come one after the other, 20 ms apart; a worker does not know periods of a second or more."""
+    rig, seen = Aligner(("a", "b", "c"), interval_s, interval_s / 2, wait_s=0.2), []
+    known_s = period_s if period_s < 1 else 0.0
+    arrivals = [
+        (n * period_s + delay_s, name, n * period_s)
+        for n in range(round(5 * interval_s / period_s) + 1)
+        for name, delay_s in (("a", 0.02), ("b", 0.04), ("c", 0.06))
+    ]
+    for now_s, name, taken_s in sorted(arrivals):
+        if rig.wants(taken_s, known_s):
+            rig.put(name, TimedImages(taken_s, IMAGES), now_s)
+            seen += rig.take(now_s)
+    assert len(seen) >= 5
+    assert all(len(group.by_camera) == 3 for group in seen[1:])

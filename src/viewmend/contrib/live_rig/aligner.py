@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 from viewmend.data.camera_images import CameraImages
 
 ABSENT_S = 0.5
-"""A group does not wait for cameras that were silent for this many seconds."""
+"""A group does not wait for cameras that were silent for this many seconds, and for `ABSENT_TICKS`."""
+ABSENT_TICKS = 1.5
+"""In slow rigs, a camera that has sent an image for each tick is silent for up to this many ticks."""
 PHASE_GAIN = 0.05
 """The ticks follow the cameras: each group moves later ticks by this fraction of the median offset of its
 images from their tick."""
@@ -60,7 +62,7 @@ class Aligner:
     """Groups images by tick. One thread at a time may call it.
 
     A group is complete when each camera has sent an image for the group's tick or a later tick. Cameras that
-    have been silent for `ABSENT_S` are not waited for.
+    have been silent for `ABSENT_S` and `ABSENT_TICKS` are not waited for.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
@@ -75,6 +77,7 @@ class Aligner:
         self._interval_s = interval_s
         self._tolerance_s = tolerance_s
         self._wait_s = wait_s
+        self._absent_s = max(ABSENT_S, ABSENT_TICKS * interval_s)
         self._origin_s: float | None = None
         """Time of tick 0; None before the first image."""
         self._max_groups = MAX_COMPLETE + math.ceil(wait_s / interval_s)
@@ -90,9 +93,9 @@ class Aligner:
     def wants(self, taken_s: float, period_s: float) -> bool:
         """Whether an image may be used. From a fast camera, only the image nearest to each tick is used.
 
-        `period_s` is the time between two images of the camera.
+        `period_s` is the time between two images of the camera; 0 if it is unknown.
         """
-        if self._interval_s < FAST_RATIO * period_s:
+        if period_s == 0 or self._interval_s < FAST_RATIO * period_s:
             return True
         return abs(self._nearest(taken_s).offset_s) <= period_s / 2
 
@@ -141,7 +144,7 @@ class Aligner:
         if self._origin_s is None:
             return []
         taken: list[ImageGroup] = []
-        present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - ABSENT_S}
+        present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - self._absent_s}
         for tick in sorted(self._groups):
             group = self._groups[tick]
             is_incomplete = any(self._last_tick[name] < tick for name in present)
