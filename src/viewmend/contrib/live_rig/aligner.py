@@ -15,7 +15,7 @@ from viewmend.data.camera_images import CameraImages
 ABSENT_S = 0.5
 """A group does not wait for cameras that were silent for this many seconds, and for `ABSENT_TICKS`."""
 ABSENT_TICKS = 1.5
-"""In slow rigs, a camera that has sent an image for each tick is silent for up to this many ticks."""
+"""A camera of a slow rig that sends an image for each tick is silent for up to this many ticks."""
 PHASE_GAIN = 0.05
 """The ticks follow the cameras: each group moves later ticks by this fraction of the median offset of its
 images from their tick."""
