@@ -61,7 +61,7 @@ def shards(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def tiny(shards) -> TrainConfig:
     objective = PaperObjectiveConfig(model=MODEL, sampling=SAMPLING, adversarial=0.0)
     return TrainConfig(name="tiny", objective=objective, scenes=SCENES, shards=shards, **RUN)

@@ -31,6 +31,12 @@ def with_options(config, **changes):
     return replace(config, objective=replace(config.objective, **changes))
 
 
+@pytest.fixture(scope="module")
+def whole(tiny, tmp_path_factory):
+    """The folder of a run of the tiny config that was never interrupted; leave it as it is."""
+    return train(tiny, tmp_path_factory.mktemp("whole"))
+
+
 @pytest.fixture
 def every_two(monkeypatch):
     """Checkpoints are due at every second step."""
@@ -97,15 +103,12 @@ def test_checkpoints_are_due_by_time(tiny, monkeypatch):
     assert RunClock(replace(tiny, minutes=10.0), 0, 30.0).progress(0) == pytest.approx(0.05)
 
 
-def test_a_run_that_is_stopped_loses_no_step(tiny, tmp_path):
-    train(tiny, tmp_path / "whole")
+def test_a_run_that_is_stopped_loses_no_step(tiny, whole, tmp_path):
     reported = []
     train(tiny, tmp_path / "parts", report=reported.append, stopped=lambda: bool(reported))
     assert [entry.step for entry in reported] == [1]
     train(tiny, tmp_path / "parts", report=reported.append)
-    assert [entry.step for entry in reported] == [1, 2, 3, 4] and same_weights(
-        tmp_path / "whole", tmp_path / "parts"
-    )
+    assert [entry.step for entry in reported] == [1, 2, 3, 4] and same_weights(whole, tmp_path / "parts")
 
 
 def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path):
@@ -133,8 +136,7 @@ def test_automatic_precision_is_the_faster_one_and_a_run_resumes_where_the_other
     assert run.model.compute_dtype == precision
 
 
-def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, tmp_path, every_two):
-    train(tiny, tmp_path / "whole")
+def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, whole, tmp_path, every_two):
     train(tiny, tmp_path / "parts")
     (tmp_path / "parts" / CHECKPOINT).write_bytes(b"damaged")
     with pytest.raises(RunError, match=r"rename run\.previous\.safetensors to it"):
@@ -142,9 +144,7 @@ def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, t
     (tmp_path / "parts" / CHECKPOINT).unlink()
     reported = []
     train(tiny, tmp_path / "parts", report=reported.append)
-    assert [entry.step for entry in reported] == [3, 4] and same_weights(
-        tmp_path / "whole", tmp_path / "parts"
-    )
+    assert [entry.step for entry in reported] == [3, 4] and same_weights(whole, tmp_path / "parts")
 
 
 def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, monkeypatch):
