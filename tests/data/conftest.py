@@ -95,7 +95,7 @@ class PlainFolder:
 @pytest.fixture(autouse=True)
 def _carved_once(monkeypatch):
     """Hulls of equal masks are carved once, not in each test: many tests change images alone."""
-    carve_once(monkeypatch)
+    carve_once(monkeypatch, coarsely=True)
 
 
 @pytest.fixture

@@ -137,6 +137,6 @@ def carve_once(patch: pytest.MonkeyPatch, coarsely: bool = False) -> None:
 
 def compute_once(patch: pytest.MonkeyPatch) -> None:
     """Let a test use what earlier ones computed of equal captures and scenes."""
-    carve_once(patch)
+    carve_once(patch, coarsely=True)
     for place, function in remembering_functions().items():
         patch.setattr(place, function)

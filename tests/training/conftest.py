@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from reference.computed_once import compute_once
+from reference.shared_scenes import make_once
 
 from viewmend.models.paper.config import paper_small
 from viewmend.models.views.config import ViewsConfig
@@ -53,12 +54,13 @@ def log_of(out: Path) -> list[dict[str, Any]]:
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory) -> Path:
     """Clips of two frames, made once for all runs."""
-    folder = tmp_path_factory.mktemp("shards")
-    source = studio_samples("tests", clip_length=2)
-    list(
-        write_shards((sample for number in range(3) for sample in source.scene(number)), folder, shard_size=2)
-    )
-    return folder
+
+    def write(folder: Path) -> None:
+        source = studio_samples("tests", clip_length=2)
+        samples = (sample for number in range(3) for sample in source.scene(number))
+        list(write_shards(samples, folder, shard_size=2))
+
+    return make_once(tmp_path_factory, "shards", write)
 
 
 @pytest.fixture(scope="session")

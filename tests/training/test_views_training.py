@@ -8,6 +8,7 @@ from random import Random
 import pytest
 import torch
 from reference.other_device import DEVICE, other_device
+from reference.shared_scenes import make_once
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
 
 from viewmend.geometry.cameras import project, unproject
@@ -74,10 +75,11 @@ def capture(takes):
 
 @pytest.fixture(scope="session")
 def view_shards(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("view-shards")
-    maker = StoredSceneMaker(StudioRigs(VIEWS_SCENES, (0,), "tests"), VIEWS_SCENES)
-    list(write_shards((maker.scene(number)[0] for number in range(3)), folder, shard_size=2))
-    return folder
+    def write(folder):
+        maker = StoredSceneMaker(StudioRigs(VIEWS_SCENES, (0,), "tests"), VIEWS_SCENES)
+        list(write_shards((maker.scene(number)[0] for number in range(3)), folder, shard_size=2))
+
+    return make_once(tmp_path_factory, "view-shards", write)
 
 
 @pytest.fixture
