@@ -135,8 +135,8 @@ def carve_once(patch: pytest.MonkeyPatch, coarsely: bool = False) -> None:
         patch.setattr(f"viewmend.{module}.reconstruct", carve)
 
 
-def compute_once(patch: pytest.MonkeyPatch) -> None:
+def compute_once(patch: pytest.MonkeyPatch, coarsely: bool = False) -> None:
     """Let a test use what earlier ones computed of equal captures and scenes."""
-    carve_once(patch, coarsely=True)
+    carve_once(patch, coarsely)
     for place, function in remembering_functions().items():
         patch.setattr(place, function)

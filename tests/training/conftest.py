@@ -34,8 +34,8 @@ RUN: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def _computed_once(monkeypatch):
-    """Checks of a capture and people of the studio are computed once, not in each test."""
-    compute_once(monkeypatch)
+    """Checks of a capture and people of the studio are computed once, not in each test; hulls are coarse."""
+    compute_once(monkeypatch, coarsely=True)
 
 
 def studio_samples(seed: str = "0", scenes: SceneConfig = SCENES, **sampling: Any) -> SampleScenes:
