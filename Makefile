@@ -61,8 +61,12 @@ gate: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 
-pyright: .venv/installed
+pyright: out/pyright ## not again while the package is unchanged
+
+out/pyright: .venv/installed pyproject.toml $(TYPED)
 	$(BIN)/pyright
+	mkdir -p out
+	touch $@
 
 format: .venv/installed
 	$(BIN)/ruff format .
