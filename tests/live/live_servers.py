@@ -51,7 +51,7 @@ CAMERAS = ring(12)[[0, 1, 2, 4, 7, 9]]
 PIPELINE = StreamConfig(
     hull=HullConfig(resolution=32), fusion=FusionConfig(resolution=64, max_views=8, view_px=64)
 )
-WAIT_S = 60.0
+WAIT_S = 300.0
 """How long anything may take on a busy machine."""
 
 

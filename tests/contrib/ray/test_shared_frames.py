@@ -287,7 +287,7 @@ def test_frames_of_a_live_rig_appear_once_they_are_prepared(follow, monkeypatch)
 
     monkeypatch.setattr(shared_frame, "cache_frame", carve_later)
     pushed.add(frame)
-    assert is_carving.wait(60)
+    assert is_carving.wait(WAIT_S)
     version = link.ingest._version
     wait_until(lambda: link.ingest.state(version - 1, 0.0, True).version == version)
     assert source.read(0) is not None and source.span.newest == 0
@@ -320,7 +320,7 @@ def test_a_request_for_a_missing_frame_does_not_delay_others(link, monkeypatch):
     monkeypatch.setattr(source, "read", read_later)
     waiting = threading.Thread(target=link.ingest.frame, args=(missing, 600.0))
     waiting.start()
-    assert is_asked.wait(60)
+    assert is_asked.wait(WAIT_S)
     assert link.ingest.frame(0, 1.0) is not None and waiting.is_alive()
     is_released.set()
     link.ingest._notify()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from live.browser.stand_in import StandIn
 
-SCREENSHOT_S = 60.0
+SCREENSHOT_S = 300.0
 """How long a page may take on a busy machine, seconds."""
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 

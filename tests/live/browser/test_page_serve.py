@@ -45,7 +45,7 @@ def view(browser, served, request) -> Iterator[View]:
 def rest(view: View) -> None:
     """Until a picture at full quality has stayed for a while."""
     view.page.wait_for_timeout(400)
-    view.until(lambda: view.data("full") == "true", 30)
+    view.until(lambda: view.data("full") == "true")
     last = None
     while last != (last := view.data("frame")):
         view.page.wait_for_timeout(500)
@@ -70,7 +70,7 @@ def test_pictures_answer_to_pose_mode_and_time(view):
         assert np.abs(shown[name] - turned).mean() > 0.005, name
     now = int(view.data("time"))
     view.page.locator("#seek").fill(str((now + 2) % 5))
-    view.until(lambda: view.data("time") == str((now + 2) % 5), 30)
+    view.until(lambda: view.data("time") == str((now + 2) % 5))
     rest(view)
     assert np.abs(view.picture() - turned).mean() > 0.05
 
