@@ -24,6 +24,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.hull import FOREGROUND
+from viewmend.geometry.rim import rim_depth
 from viewmend.utils.tensors import OnDevice, check_tensor, extremes
 
 FAINT = 1 / 16
@@ -305,9 +306,19 @@ class IncompleteView:
         return self.error > 0 if self.fade is None else (self.error > 0) & (self.fade == 0)
 
     @cached_property
+    def coloured(self) -> Bool[Tensor, "height width"]:
+        """Pixels that a source view colours."""
+        return self.weights.sum(0) > 0  # seven times faster than `any` along an axis
+
+    @cached_property
     def holes(self) -> Bool[Tensor, "height width"]:
         """Pixels of the proxy that no source view colours: the paper's E, whatever the error rule."""
-        return (self.mask > 0) & ~(self.weights.sum(0) > 0)  # seven times faster than `any` along an axis
+        return (self.mask > 0) & ~self.coloured
+
+    @cached_property
+    def depth_with_rim(self) -> Float[Tensor, "height width"]:
+        """The proxy's depth, metres, extended by a rim of few pixels (`rim_depth`)."""
+        return rim_depth(self.depth)
 
     def closest_views(self, count: int) -> tuple[str, ...]:
         """Names of up to `count` cameras: the source views, then the closest other candidates."""

@@ -40,7 +40,7 @@ from viewmend.types import Silhouettes
 def rays_of(view):
     pixels = torch.nonzero(view.mask > 0)
     z = view.depth[tuple(pixels.T)][:, None] + SceneScale.of(view).size_m * torch.tensor(OFFSETS)
-    return Rays(view, SceneScale.of(view), pixels.flip(1).double() + 0.5, z)
+    return Rays(view, SceneScale.of(view), pixels, z)
 
 
 def rotated(cameras: Cameras, angle: float) -> Cameras:
@@ -214,7 +214,7 @@ def test_the_compiled_loop_equals_pytorch(samples, own_prior):
 def some_cameras(rays, cameras: int, count: int):
     """Indices of cameras for each ray, drawn at random."""
     rng = torch.Generator().manual_seed(3)
-    return torch.rand(len(rays.uv_px), cameras, generator=rng).argsort(1)[:, :count].contiguous()
+    return torch.rand(len(rays.cells), cameras, generator=rng).argsort(1)[:, :count].contiguous()
 
 
 @pytest.mark.parametrize("cubic", [False, True])

@@ -14,8 +14,7 @@ BEYOND_M = 1e30
 
 def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """The depth, metres, extended by `RIM_PX` around the proxy with the smallest depth nearby; 0 elsewhere."""
-    has_depth = depth > 0
-    far = torch.where(has_depth, depth, BEYOND_M)
+    far = F.threshold(depth, 0.0, BEYOND_M)
     side = 2 * RIM_PX + 1
     on_cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
     if on_cpu and not torch.compiler.is_exporting():  # ten times as fast as PyTorch
@@ -26,4 +25,4 @@ def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height wid
         near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
     else:
         near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
-    return torch.where(has_depth, depth, near) * (near < BEYOND_M)
+    return torch.where(depth > 0, depth, near) * (near < BEYOND_M)

@@ -44,7 +44,7 @@ def blend(known: Image, error: Plane, inpainted: Image, coverage: Plane, clamp: 
 
     With `clamp`, Ftilde is clamped to [0, 1] first.
     """
-    completed = error * (inpainted.clamp(0, 1) if clamp else inpainted) + (1 - error) * known
+    completed = torch.lerp(known, inpainted.clamp(0, 1) if clamp else inpainted, error)
     return torch.where((error > 0) & (coverage > 0), completed, known)
 
 

@@ -25,7 +25,7 @@ from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, load_lpips
 from viewmend.models.checkpoint import load_inpainter, load_network
 from viewmend.models.network import set_compute_dtype
-from viewmend.models.views.config import OFFSETS, ViewsConfig
+from viewmend.models.views.config import COLOUR, OFFSETS, ViewsConfig
 from viewmend.models.views.grid import CELL_PX, nearest_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.models.views.prediction import ViewPrediction
@@ -370,7 +370,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
         cells = tuple(distribution.cells.T)
         shares = distribution.logits.softmax(1)[..., None]
         truth = F.avg_pool2d(crop.truth[None] / 255, CELL_PX, ceil_mode=True)[0, :, cells[0], cells[1]].T
-        colour = ((shares * distribution.samples.colour).sum(1) - truth).abs().mean()
+        colour = ((shares * distribution.samples.rgba[..., COLOUR]).sum(1) - truth).abs().mean()
         total = weights.cell_colour * colour
         return total if crop.depth is None else total + self._depth_terms(crop, prediction, crop.depth)
 

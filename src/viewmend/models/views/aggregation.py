@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.threads import all_threads, parallel_for
-from viewmend.models.views.config import COLOUR, CONTRAST, IN_VIEW, MASK, NUM_FEATURES, NUM_STATISTICS
+from viewmend.models.views.config import COLOUR, CONTRAST, IN_VIEW, NUM_FEATURES, NUM_STATISTICS, RGBA
 from viewmend.models.views.sampler import RaySamples
 
 BAND = 1024
@@ -19,10 +19,8 @@ BAND = 1024
 class AggregatedSamples(NamedTuple):
     """Ray samples after aggregation over cameras."""
 
-    colour: Float[Tensor, "ray sample 3"]
-    """The weighted mean of the cameras' RGB on black."""
-    mask: Float[Tensor, "ray sample 1"]
-    """The weighted mean of the cameras' masks."""
+    rgba: Float[Tensor, "ray sample 4"]
+    """The weighted means of the cameras' RGB on black, and of their masks."""
     features: Float[Tensor, "ray sample feature"]
     score: Float[Tensor, "ray sample"]
     """Evidence that the surface is at the sample."""
@@ -32,6 +30,8 @@ class AggregatedSamples(NamedTuple):
     @classmethod
     def cat(cls, parts: Sequence["AggregatedSamples"]) -> "AggregatedSamples":
         """All rays of these parts."""
+        if len(parts) == 1:
+            return parts[0]
         return cls(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
@@ -75,7 +75,7 @@ class SampleAggregator(nn.Module):
         variance = CONTRAST * (square - mean[..., COLOUR].square()).clamp_min(0)
         certainty = trust.square().sum(2, keepdim=True)
         out = self.sample(torch.cat([summary.float(), mean, variance, statistics, certainty], -1))
-        return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
+        return AggregatedSamples(mean[..., RGBA], out[..., :-1], out[..., -1], trust)
 
     def _aggregate_numba(
         self, samples: RaySamples, prior: Float[Tensor, "ray sample view"]
@@ -110,7 +110,7 @@ class SampleAggregator(nn.Module):
             parallel_for(work, -(-count // rays))
             out = self.sample(inputs)
         mean = inputs[..., len(weight) :]
-        return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
+        return AggregatedSamples(mean[..., RGBA], out[..., :-1], out[..., -1], trust)
 
 
 def _weighted_sum(

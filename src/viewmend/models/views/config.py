@@ -17,8 +17,8 @@ NUM_FEATURES = 18
 cameras' mean, and the prior weight."""
 COLOUR = slice(0, 3)
 """These features of a ray sample are the camera's RGB on black."""
-MASK = slice(3, 4)
-"""This feature of a ray sample is the camera's mask."""
+RGBA = slice(0, 4)
+"""These features of a ray sample are the camera's RGB on black, and its mask."""
 IN_VIEW = 8
 """This feature of a ray sample is 1 if the camera has the sample in view, else 0."""
 NUM_STATISTICS = 10

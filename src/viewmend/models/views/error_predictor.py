@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.geometry.rim import rim_depth
 from viewmend.models.base import ErrorMap, RenderQuality
 from viewmend.models.compositing import blend
 from viewmend.models.network import Network
@@ -84,7 +83,7 @@ class ErrorPredictor(Network):
         height, width = view.depth.shape
         right = -width % (2 * CELL_PX)
         below = -height % (2 * CELL_PX)
-        depth = F.pad(rim_depth(view.depth), (0, right, 0, below))
+        depth = F.pad(view.depth_with_rim, (0, right, 0, below))
         near = nearest_depth(depth)
 
         # The rendered view: the pixels of each cell as channels
@@ -111,8 +110,8 @@ class ErrorPredictor(Network):
             return self(view, sources)
         small = downsample2x(view)
         errors = torch.stack(self(small, sources))
-        upsampled = upsample2x(errors, rim_depth(small.depth) > 0, view.mask.shape)
-        return ErrorMap(*torch.where(rim_depth(view.depth) > 0, upsampled, 0.0))
+        upsampled = upsample2x(errors, small.depth_with_rim > 0, view.mask.shape)
+        return ErrorMap(*torch.where(view.depth_with_rim > 0, upsampled, 0.0))
 
     @staticmethod
     def _statistics(
@@ -126,8 +125,8 @@ class ErrorPredictor(Network):
     ) -> Float[Tensor, "channel rows columns"]:
         """An image of cells with the statistics of samples at distances `behind` the nearest depth of each cell."""
         cells = torch.nonzero(near > 0)
-        z = near[tuple(cells.T)][:, None] + scale.size_m * near.new_tensor(behind)
-        rays = Rays(view, scale, cell_px * (cells.flip(1).double() + 0.5), z)
+        z = scale.depths_behind(near[tuple(cells.T)], behind)
+        rays = Rays(view, scale, cells, z, cell_px=cell_px)
         statistics = sample_rays(rays, sources, float(cell_px)).statistics.flatten(1)
         features = statistics if layers is None else layers(statistics)
         return scatter_to_image(features, cells, near.shape)

@@ -80,14 +80,9 @@ def upsample2x(
 
 def nearest_depth(depth: Float[Tensor, "*image height width"]) -> Float[Tensor, "*image rows columns"]:
     """The smallest depth in each cell, metres, of the pixels that have one (above 0); 0 if no pixel has."""
-    nearness = -torch.where(depth > 0, depth, BEYOND_M).view(-1, *depth.shape[-2:])
+    nearness = -F.threshold(depth, 0.0, BEYOND_M).view(-1, *depth.shape[-2:])
     nearest = -F.max_pool2d(nearness, CELL_PX, ceil_mode=True)
     return (nearest * (nearest < BEYOND_M)).view(*depth.shape[:-2], *nearest.shape[1:])
-
-
-def any_in_cell(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "rows columns"]:
-    """The cells that contain any of these pixels."""
-    return F.max_pool2d(pixels.float()[None], CELL_PX, ceil_mode=True)[0] > 0
 
 
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:

@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.geometry.rim import rim_depth
 from viewmend.geometry.threads import all_threads, one_thread
 from viewmend.models.base import ContextProvider, DepthMap, ErrorMap, RenderQuality, State
 from viewmend.models.compositing import opaque_in_mask
@@ -29,11 +28,9 @@ from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregator
 from viewmend.models.views.config import (
-    COLOUR,
-    MASK,
-    NUM_FEATURES,
     OFFSETS,
     RAY_VIEWS,
+    RGBA,
     RaysConfig,
     ViewsConfig,
 )
@@ -44,7 +41,6 @@ from viewmend.models.views.grid import (
     LARGE_CELLS_FROM,
     Pixels,
     UNet,
-    any_in_cell,
     cell_means,
     concatenate_channels,
     crop_to,
@@ -118,13 +114,12 @@ class ViewImage(NamedTuple):
     @classmethod
     def of(cls, view: IncompleteView, filled: Image, predicted: Mask) -> "ViewImage":
         """The channels of a rendered view, given its image with filled holes and its pixels to predict."""
-        coloured = view.weights.sum(0) > 0
-        return cls(filled, view.mask, coloured.float(), view.weights.amax(0), predicted.float())
+        return cls(filled, view.mask, view.coloured.float(), view.weights.amax(0), predicted.float())
 
     def stacked(self) -> Float[Tensor, "7 height width"]:
         """All channels in one image."""
         planes = [self.mask, self.coloured, self.largest_weight, self.predicted]
-        return torch.cat([self.filled, torch.stack(planes)])
+        return torch.cat([self.filled, *(plane[None] for plane in planes)])
 
 
 class CandidateColours(NamedTuple):
@@ -139,9 +134,10 @@ class CandidateColours(NamedTuple):
     rendered: Float[Tensor, "pixel 3"]
     """The rendered view, with holes filled by `ViewSynthNet.fill_holes`."""
 
-    def stacked(self) -> Float[Tensor, "pixel 4 3"]:
-        """All colours in one tensor. The network scores them in this order."""
-        return torch.stack([self.trusted, self.single, self.soft, self.rendered], 1)
+    @classmethod
+    def unstack(cls, stacked: Float[Tensor, "pixel 4 3"]) -> "CandidateColours":
+        """The fields as views of stacked colours, which the network scores in this order."""
+        return cls(*stacked.unbind(1))
 
 
 class ViewSynthNet(Network):
@@ -218,7 +214,7 @@ class ViewSynthNet(Network):
             scale = SceneScale.of(view)
         if filled is None:
             filled = self.fill_holes(view, sources)
-        with_rim = replace(view, depth=rim_depth(view.depth))
+        with_rim = replace(view, depth=view.depth_with_rim)
         has_depth = with_rim.depth > 0
         predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
@@ -227,8 +223,9 @@ class ViewSynthNet(Network):
         large_cells = allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM
         cell_inputs = halve(with_rim, predicted, image) if large_cells else (with_rim, predicted, image)
         cell_view, cell_predicted, cell_image = cell_inputs
-        pixels, cells = nonzero_of(predicted, any_in_cell(cell_predicted))
-        distribution = self._depth_distribution(cell_view, cell_predicted, cell_image, sources, scale, cells)
+        cell_depth = depth_of_cells(cell_view, cell_predicted)
+        pixels, cells = nonzero_of(predicted, cell_depth[0] > 0)
+        distribution = self._depth_distribution(cell_view, cell_image, sources, scale, cells, cell_depth)
         if large_cells:
             distribution = distribution._replace(cell_px=2 * CELL_PX)
         return self._blend(with_rim, sources, scale, pixels, image, distribution)
@@ -274,11 +271,12 @@ class ViewSynthNet(Network):
             return None
         filled = self.fill_holes(view, sources, quick=True)
         scale = SceneScale.of(view)
-        with_rim = replace(view, depth=rim_depth(view.depth))
+        with_rim = replace(view, depth=view.depth_with_rim)
         predicted = with_rim.depth > 0
         image = ViewImage.of(view, filled, predicted)
-        pixels, cells = nonzero_of(predicted, any_in_cell(predicted))
-        distribution = self._depth_distribution(with_rim, predicted, image, sources, scale, cells)
+        cell_depth = depth_of_cells(with_rim, predicted)
+        pixels, cells = nonzero_of(predicted, cell_depth[0] > 0)
+        distribution = self._depth_distribution(with_rim, image, sources, scale, cells, cell_depth)
         shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
         surface = surface_points(with_rim.depth, scale, pixels, distribution, shares)
         found = torch.stack([surface.depth, surface.probability], 1)
@@ -307,7 +305,7 @@ class ViewSynthNet(Network):
         use all.
         """
         fraction = context.quality.refine_fraction
-        where = view.refine_mask & (rim_depth(view.depth) > 0)
+        where = view.refine_mask & (view.depth_with_rim > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
         # At the lowest quality, holes are filled without the cameras, if there is anything to inpaint
@@ -317,7 +315,8 @@ class ViewSynthNet(Network):
         # Without a pixel to predict, or without a camera, nothing is predicted. Background that `view.fade`
         # marks is still attenuated
         sources = None
-        if bool(where.any()):
+        scale, count = SceneScale.with_count(view, where)
+        if count:
             sources = SourceCameras.closest_to(view, context, self.config.num_views)
         if sources is None:
             completed = CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, faded)
@@ -326,7 +325,6 @@ class ViewSynthNet(Network):
         # Otherwise, `where` is predicted. At reduced quality, E and hence `where` are already limited to a
         # fraction of the subject
         reduced_quality = fraction is not None
-        scale = SceneScale.of(view)
         filled = self.fill_holes(view, sources, quick=reduced_quality, scale=scale)
         prediction = self(view, sources, scale, where=where, filled=filled, allow_large_cells=True)
 
@@ -339,24 +337,24 @@ class ViewSynthNet(Network):
     def _depth_distribution(
         self,
         view: IncompleteView,
-        predicted: Mask,
         image: ViewImage,
         sources: SourceCameras,
         scale: SceneScale,
         cells: Pixels,
+        cell_depth: Float[Tensor, "2 rows columns"],
     ) -> DepthDistribution:
         """Samples the cameras on the rays of cells with a pixel to predict, and scores the samples by a U-Net.
 
-        `view` has depth on the rim, too.
+        `view` has depth on the rim, too; `cell_depth` is its `depth_of_cells`.
         """
         # The cameras and depth hypotheses of the cells' rays
-        proxy_depth, whole_depth = nearest_depth(torch.stack([view.depth * predicted, view.depth]))
+        proxy_depth, whole_depth = cell_depth
         rows, columns = cells.unbind(1)
-        proxy_z = proxy_depth[rows, columns][:, None]
-        uv_px = CELL_PX * (cells.flip(1).double() + 0.5)
-        choosing_z = proxy_z + scale.size_m * proxy_z.new_tensor(CHOOSING_OFFSETS)
-        cameras = choose_cameras(Rays(view, scale, uv_px, choosing_z), sources, RAY_VIEWS)
-        rays = Rays(view, scale, uv_px, proxy_z + scale.size_m * proxy_z.new_tensor(OFFSETS), cameras)
+        proxy_z = proxy_depth[rows, columns]
+        choosing_z = scale.depths_behind(proxy_z, CHOOSING_OFFSETS)
+        choosing_rays = Rays(view, scale, cells, choosing_z, cell_px=CELL_PX)
+        cameras = choose_cameras(choosing_rays, sources, RAY_VIEWS)
+        rays = replace(choosing_rays, z_m=scale.depths_behind(proxy_z, OFFSETS), cameras=cameras)
 
         # Further inputs of the U-Net, in all cells: the rendered view, and all depth of the proxy and its rim
         has_depth = whole_depth > 0
@@ -404,18 +402,19 @@ class ViewSynthNet(Network):
         # Weigh the cameras
         stop_if_cancelled()
         aggregated = self._aggregate_pixels(samples, surface, distribution)
-        mask = aggregated.mask[:, 0].squeeze(1)
+        mask = aggregated.rgba[:, 0, 3]
 
         # The last convolutions score the candidate colours, and predict alpha, confidence and gains
-        colours = candidate_colours(samples.features[:, 0], aggregated, means, image, pixels)
+        candidates = candidate_colours(samples.features[:, 0], aggregated, means, image, pixels)
+        colours = CandidateColours.unstack(candidates)
         statistics = RayStatistics.unstack(samples.statistics[:, 0])
-        inputs = pixel_inputs(colours, mask, means.mask, statistics, surface, image, pixels)
+        inputs = pixel_inputs(candidates, mask, means.rgba[:, 3:], statistics, surface, image, pixels)
         inputs = torch.cat([inputs, aggregated.features[:, 0]], 1)
         out = self._blending_layers(inputs, pixels, view.mask.shape, features_at_cells(distribution, view))
         scores, alpha_logit, confidence_logit, gains = out.split(OUTPUT_CHANNELS, 1)
 
         # Blend the colours, then add detail
-        blended = (scores.softmax(1)[..., None] * colours.stacked()).sum(1)
+        blended = (scores.softmax(1)[:, None] @ candidates)[:, 0]
         detail_sources = torch.stack([blended, colours.single, colours.rendered], 1)
         magnification = sources.magnification(view.camera, scale)
         detail = amplify_detail(detail_sources, mask, gains, pixels, view.mask.shape, magnification)
@@ -462,6 +461,11 @@ class ViewSynthNet(Network):
         return out[0, :, rows, columns].T.float()
 
 
+def depth_of_cells(view: IncompleteView, predicted: Mask) -> Float[Tensor, "2 rows columns"]:
+    """The nearest depth in each cell, metres: of the pixels to predict, and of all; 0 where none has one."""
+    return nearest_depth(torch.stack([view.depth * predicted, view.depth]))
+
+
 def halve(
     view: IncompleteView, predicted: Mask, image: ViewImage
 ) -> tuple[IncompleteView, Bool[Tensor, "rows columns"], ViewImage]:
@@ -484,8 +488,7 @@ def surface_rays(
 ) -> Rays:
     """The rays of some pixels, each with one sample on the surface and the cameras of the pixel's cell."""
     cameras = None if distribution.cameras is None else distribution.cameras[surface.cell]
-    uv_px = pixels.flip(1).double() + 0.5
-    return Rays(view, scale, uv_px, surface.depth.detach()[:, None], cameras)
+    return Rays(view, scale, pixels, surface.depth.detach()[:, None], cameras)
 
 
 def features_at_cells(
@@ -521,8 +524,7 @@ def amplify_detail(
         magnification: that of the images (`SourceCameras.magnification`).
     """
     bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)
-    gain_of_image = gains.unflatten(1, bands.shape[1:3])[..., None]  # [pixel, band, image, 1]
-    return (gain_of_image * bands).sum((1, 2))
+    return (gains[:, None] @ bands.flatten(1, 2))[:, 0]
 
 
 def candidate_colours(
@@ -531,8 +533,8 @@ def candidate_colours(
     means: HypothesisMeans,
     image: ViewImage,
     pixels: Pixels,
-) -> CandidateColours:
-    """The colours that each pixel may blend.
+) -> Float[Tensor, "pixel 4 3"]:
+    """The `CandidateColours` that each pixel may blend, stacked.
 
     Args:
         features: features of each pixel's sample on the surface, in each camera.
@@ -541,20 +543,16 @@ def candidate_colours(
         image: the rendered view.
         pixels: row and column of each pixel.
     """
-    # The mean of the cameras, weighted by trust
-    trusted = unpremultiply(aggregated.colour[:, 0], aggregated.mask[:, 0])
-
-    # The most trusted camera alone
     best = aggregated.trust[:, 0].argmax(1)
-    best_features = features.gather(1, best[:, None, None].expand(-1, 1, NUM_FEATURES))[:, 0]
-    single = unpremultiply(best_features[:, COLOUR], best_features[:, MASK])
-
+    single = features[..., RGBA].gather(1, best[:, None, None].expand(-1, 1, 4))
+    of_cameras = unpremultiply(torch.cat([aggregated.rgba, single, means.rgba[:, None]], 1))
     rows, columns = pixels.unbind(1)
-    return CandidateColours(trusted, single, means.colour, image.filled[:, rows, columns].T)
+    rendered = image.filled[:, rows, columns].T
+    return torch.cat([of_cameras, rendered[:, None]], 1)
 
 
 def pixel_inputs(
-    colours: CandidateColours,
+    candidates: Float[Tensor, "pixel 4 3"],
     mask: Float[Tensor, "pixel"],
     soft_mask: Float[Tensor, "pixel 1"],
     statistics: RayStatistics,
@@ -567,7 +565,7 @@ def pixel_inputs(
     Trained weights depend on the order of these channels.
 
     Args:
-        colours: the candidate colours.
+        candidates: the candidate colours, stacked.
         mask: the cameras' mean mask on the surface.
         soft_mask: the mean mask over the depth hypotheses.
         statistics: those of the sample on the surface.
@@ -576,11 +574,9 @@ def pixel_inputs(
         pixels: row and column of each pixel.
     """
     rows, columns = pixels.unbind(1)
+    colours = CandidateColours.unstack(candidates)
     inputs = [
-        colours.trusted,
-        colours.single,
-        colours.soft,
-        colours.rendered,
+        candidates.flatten(1),
         colours.trusted - colours.rendered,
         mask[:, None],
         soft_mask,

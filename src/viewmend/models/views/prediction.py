@@ -68,21 +68,10 @@ class DepthDistribution(NamedTuple):
     ) -> Float[Tensor, "pixel channel"]:
         """The cells' values at pixels (row, column), interpolated bilinearly between existing cells."""
         weighted = F.pad(values, (0, 1), value=1.0)  # the last channel sums the weights of existing cells
-        padded = F.pad(weighted, (0, 0, 0, 1))  # the last row stands for missing cells
-
-        # In each direction, a pixel lies between the centre of its own cell and that of a neighbour
-        own = pixels // self.cell_px
-        from_center = (pixels % self.cell_px + 0.5) / self.cell_px - 0.5
-        last = torch.tensor(self.cell_index.shape, device=own.device) - 1
-        neighbour = torch.minimum((own + from_center.sign().long()).clamp_min(0), last)
-        row, column = torch.stack([own, neighbour], -1).unbind(1)
-        share = from_center.abs().to(padded)
-        row_weight, column_weight = torch.stack([1 - share, share], -1).unbind(1)
-
-        # The weighted sum of the four cells around the pixel
-        index = self.cell_index[row[:, :, None], column[:, None, :]].flatten(1)
-        weight = (row_weight[:, :, None] * column_weight[:, None, :]).flatten(1)
-        total = (weight[..., None] * padded[index]).sum(1)
+        image = scatter_to_image(weighted, self.cells, self.cell_index.shape)[None]
+        fine = F.interpolate(image, scale_factor=self.cell_px, mode="bilinear", align_corners=False)[0]
+        rows, columns = pixels.unbind(1)
+        total = fine.movedim(0, 2)[rows, columns]
         return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
 
 
@@ -91,20 +80,16 @@ class HypothesisMeans(NamedTuple):
 
     probability: Float[Tensor, "pixel sample"]
     """Probability of the surface being at each hypothesis."""
-    colour: Float[Tensor, "pixel 3"]
-    """Mean RGB in [0, 1], not multiplied by alpha."""
-    mask: Float[Tensor, "pixel 1"]
-    """Mean mask."""
+    rgba: Float[Tensor, "pixel 4"]
+    """Mean RGB on black, and mean mask."""
 
     @classmethod
     def of(cls, distribution: DepthDistribution, pixels: Pixels) -> "HypothesisMeans":
         """Those of pixels (row, column)."""
         probability = distribution.logits.softmax(1)
-        cell_colour = (probability[..., None] * distribution.samples.colour).sum(1)
-        cell_mask = (probability[..., None] * distribution.samples.mask).sum(1)
-        found = distribution.interpolate(torch.cat([probability, cell_colour, cell_mask], 1), pixels)
-        shares, colour, mask = found.split((len(OFFSETS), 3, 1), 1)
-        return cls(shares, unpremultiply(colour, mask), mask)
+        cell_rgba = (probability[:, None] @ distribution.samples.rgba)[:, 0]
+        found = distribution.interpolate(torch.cat([probability, cell_rgba], 1), pixels)
+        return cls(*found.split((len(OFFSETS), 4), 1))
 
 
 class SurfacePoints(NamedTuple):
@@ -156,32 +141,29 @@ class ViewPrediction(NamedTuple):
             keep_islands: keep the `artefact_islands`, which are removed otherwise.
         """
         shape = view.mask.shape
-        values = torch.cat([self.rgb, torch.stack([self.alpha, self.confidence, self.depth], 1)], 1)
-        planes = scatter_to_image(values, self.pixels, shape)
-        rgb = planes[:3]
-        alpha = planes[3]
+        values = [self.rgb, self.alpha[:, None], self.confidence[:, None], self.depth[:, None]]
+        planes = scatter_to_image(torch.cat(values, 1), self.pixels, shape)
         if fill is not None:
-            mixed = RAY_FILL_SHARE * fill + (1 - RAY_FILL_SHARE) * rgb
-            under_alpha = torch.minimum(mixed, alpha)  # the fill has no alpha of its own
-            rgb = torch.where(predicted & view.holes, under_alpha, rgb)
+            mixed = torch.lerp(planes[:3], fill, RAY_FILL_SHARE)
+            under_alpha = torch.minimum(mixed, planes[3])  # the fill has no alpha of its own
+            rgb = torch.where(predicted & view.holes, under_alpha, planes[:3])
             planes = torch.cat([rgb, planes[3:]])
         if not keep_islands:
-            colour = torch.where(predicted, rgb, view.rgb).amax(0)
-            opacity = torch.where(predicted, alpha, view.mask)
-            planes = planes * ~artefact_islands(colour, opacity, predicted)
+            shown = torch.where(predicted, planes[:4], torch.cat([view.rgb, view.mask[None]]))
+            islands = artefact_islands(shown, predicted)
+            planes = planes if islands is None else planes * ~islands
         rgb = planes[:3]
         alpha, confidence, depth = planes[3:]
 
         E = view.error
-        rest = 1 - E
         changed = predicted | faded
 
         # The confidence of a pixel that is not predicted is 1 on the subject and 0 elsewhere
         return CompletedView(
             view,
-            rgb=blend(view.rgb, E, rgb, changed.to(E)),
-            alpha=torch.where(changed, E * alpha + rest * view.mask, view.mask),
-            confidence=torch.where(predicted, E * confidence + rest, view.mask),
+            rgb=blend(view.rgb, E, rgb, changed),
+            alpha=torch.where(changed, torch.lerp(view.mask, alpha, E), view.mask),
+            confidence=torch.where(predicted, torch.addcmul(1 - E, E, confidence), view.mask),
             depth=torch.where(predicted, depth * (alpha > 0.5), view.depth),
         )
 
@@ -199,10 +181,10 @@ def surface_points(
     has the depth of another surface in front of it. `shares` are the probabilities of the depth hypotheses.
     """
     # The most probable hypothesis, and the mean offset around it
-    best = shares.argmax(1)
-    around = torch.stack([best - 1, best, best + 1], 1).clamp(0, len(OFFSETS) - 1)
-    weight = shares.gather(1, around) + 1e-6
-    offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
+    probability, best = shares.max(1)
+    sums = ((shares + 1e-6) @ _sums_of_neighbours().to(shares)).unflatten(1, (2, len(OFFSETS)))
+    weighted, weight = sums.gather(2, best[:, None, None].expand(-1, 2, 1)).squeeze(2).unbind(1)
+    offset = weighted / weight
 
     # The depth that the offset is added to: the pixel's own, or that of a nearer surface in its cell
     cell_row, cell_column = (pixels // distribution.cell_px).unbind(1)
@@ -211,32 +193,43 @@ def surface_points(
     cell_depth = distribution.proxy_depth[cell_row, cell_column]
     same_surface = (own_depth - cell_depth).abs() < SAME_SURFACE * scale.size_m
     depth = torch.where(same_surface, own_depth, cell_depth) + scale.size_m * offset
-    return SurfacePoints(cell, best, shares.amax(1), offset, depth)
+    return SurfacePoints(cell, best, probability, offset, depth)
 
 
-def artefact_islands(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
-    """Pixels of islands to remove by `IslandRule`. All pixels of such an island are `predicted`.
+def _sums_of_neighbours() -> Float[Tensor, "sample 28"]:
+    """A matrix that sums shares times `OFFSETS` over each depth hypothesis and its neighbours, and shares alone.
 
-    `colour` is the largest channel of each pixel.
+    The first and the last hypothesis have one neighbour, and count twice.
+    """
+    hypothesis = torch.arange(len(OFFSETS))
+    around = (hypothesis[:, None] + torch.tensor([-1, 0, 1])).clamp(0, len(OFFSETS) - 1)
+    counted = F.one_hot(around, len(OFFSETS)).sum(1).T
+    return torch.cat([counted * torch.tensor(OFFSETS)[:, None], counted], 1)
+
+
+def artefact_islands(rgba: Float[Tensor, "4 height width"], predicted: Mask) -> Mask | None:
+    """Pixels of islands to remove by `IslandRule`; None if there are none.
+
+    All pixels of such an island are `predicted`.
     """
     rule = IslandRule()
-    visible = (torch.maximum(colour, alpha) > rule.visible).cpu().numpy()
+    visible = (rgba.amax(0) > rule.visible).cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:  # the background and at most one island
-        return torch.zeros_like(predicted)
+        return None
     area = stats[:, cv2.CC_STAT_AREA]
     share = area / area[1:].max()
-    total_alpha = np.bincount(labels.ravel(), alpha.float().cpu().numpy().ravel())
+    total_alpha = np.bincount(labels.ravel(), rgba[3].float().cpu().numpy().ravel())
     faint = total_alpha < rule.faint * area
     rendered = np.bincount(labels[~predicted.cpu().numpy()], minlength=count) > 0
     small = (share < rule.tiny) | ((share < rule.small) & faint)
     removed = small & ~rendered
     removed[0] = False  # the background
+    if not removed.any():
+        return None
     return torch.from_numpy(removed[labels]).to(predicted.device)
 
 
-def unpremultiply(
-    colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]
-) -> Float[Tensor, "pixel 3"]:
+def unpremultiply(rgba: Float[Tensor, "*pixel 4"]) -> Float[Tensor, "*pixel 3"]:
     """Colours on black, divided by their mask."""
-    return (colour / mask.clamp_min(MIN_MASK)).clamp(0, 1)
+    return (rgba[..., :3] / rgba[..., 3:].clamp_min(MIN_MASK)).clamp(0, 1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -50,14 +50,28 @@ class SceneScale:
             size_m = torch.where(count > 0, _size_m(area, median, view.camera), 1.0)
             depth_m = torch.where(count > 0, median, 1.0)
             return cls(size_m, depth_m, area.sqrt().double())
-        area_px = (view.mask > 0).sum()
-        median_m = torch.where(covered, view.depth, torch.nan).nanmedian()
-        area, median = torch.stack([area_px.double(), median_m.double()]).cpu()  # one copy from the device
+        return cls.with_count(view, covered)[0]
+
+    @classmethod
+    def with_count(
+        cls, view: IncompleteView, pixels: Bool[Tensor, "height width"]
+    ) -> "tuple[SceneScale, int]":
+        """The scale of a view, and the number of these pixels; waits for a GPU only once."""
+        counts = [some.sum(dtype=torch.double) for some in (view.mask > 0, pixels)]
+        median_m = view.depth.masked_fill(view.depth <= 0, torch.nan).nanmedian()
+        area, count, median = torch.stack([*counts, median_m.double()]).cpu()
         subject_px = float(area.float().sqrt())
         if bool(median.isnan()):
-            return cls(1.0, 1.0, subject_px)
+            return cls(1.0, 1.0, subject_px), int(count)
         size_m = _size_m(area.long(), median.float(), view.camera.on_host)
-        return cls(float(size_m), float(median), subject_px)
+        return cls(float(size_m), float(median), subject_px), int(count)
+
+    def depths_behind(
+        self, depth_m: Float[Tensor, "ray"], offsets: Sequence[float]
+    ) -> Float[Tensor, "ray sample"]:
+        """z-depths, metres, that lie these subject sizes behind a depth."""
+        offsets_m = self.size_m * torch.tensor(offsets)
+        return depth_m[:, None] + offsets_m.to(depth_m.device)
 
 
 def _size_m(area_px: Int[Tensor, ""], median_m: Float[Tensor, ""], camera: Cameras) -> Float[Tensor, ""]:

@@ -325,8 +325,7 @@ def sample_behind_proxy(
         depth = torch.where(depth > 0, depth, scale.depth_m)
     elif not all_have_depth and not bool((depth > 0).all()):
         depth = pull_push(view.depth[None], view.depth > 0)[0][pixels[:, 0], pixels[:, 1]]
-    z = depth[:, None] + scale.size_m * depth.new_tensor(offsets)
-    return sample_fill_rays(Rays(view, scale, pixels.flip(1) + 0.5, z), sources)
+    return sample_fill_rays(Rays(view, scale, pixels, scale.depths_behind(depth, offsets)), sources)
 
 
 def multi_scale_context(

@@ -56,22 +56,25 @@ class Rays:
     """The novel view, or a crop of it."""
     scale: SceneScale
     """The scale of the whole view."""
-    uv_px: Float[Tensor, "ray 2"]
+    cells: Int[Tensor, "ray 2"]
+    """Row and column of the square through whose middle each ray goes."""
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""
     cameras: Int[Tensor, "ray view"] | None = None
     """Indices of the source cameras that are sampled on each ray; None for all. An index beyond the
     last camera stands for no camera."""
+    cell_px: int = 1
+    """Side of a square, pixels."""
 
     def split(self, size: int | None) -> "list[Rays]":
         """Chunks of `size` rays; None gives one chunk."""
         if size is None:
             return [self]
         parts = []
-        for first in range(0, max(1, len(self.uv_px)), size):
+        for first in range(0, max(1, len(self.cells)), size):
             own = slice(first, first + size)
             cameras = None if self.cameras is None else self.cameras[own]
-            parts.append(replace(self, uv_px=self.uv_px[own], z_m=self.z_m[own], cameras=cameras))
+            parts.append(replace(self, cells=self.cells[own], z_m=self.z_m[own], cameras=cameras))
         return parts
 
     @property
@@ -100,8 +103,11 @@ class Rays:
     @cached_property
     def directions(self) -> Float[Tensor, "ray 3"]:
         """The step along each ray per metre of z-depth, world coordinates."""
-        uv = self.uv_px.double()
-        return F.pad(uv, (0, 1), value=1.0) @ self.world_from_pixel.T.to(uv.device)
+        along_u, along_v, start = self.world_from_pixel.unbind(1)
+        rows = self.cell_px * along_v
+        columns = self.cell_px * along_u
+        from_cell = torch.stack([rows, columns, start + 0.5 * (rows + columns)], 1).to(self.cells.device)
+        return F.linear(self.cells.double(), from_cell[:, :2], from_cell[:, 2])
 
 
 class RaySamples(NamedTuple):
@@ -226,7 +232,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
         levels = levels.of_cameras(chosen)
 
     # Positions in the cameras, and distances behind the proxy there
-    projected, in_silhouettes = _project_into_all(rays, sources, chosen)
+    projected, cosines, in_silhouettes = _project_into_all(rays, sources, chosen)
     if rays.cameras is not None and torch.compiler.is_exporting():
         projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
     behind = _distance_behind(sources, projected, chosen)
@@ -238,7 +244,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     else:
         fine_with_coverage, wide = sample_level(levels, projected, RGB_MASK_COVERAGE)
         fine = fine_with_coverage[..., :RGB_MASK]
-    stacked = _camera_features(rays, sources, projected, fine, wide, behind, F.softsign, chosen)
+    stacked = _camera_features(rays, sources, projected, cosines, fine, wide, behind, F.softsign, chosen)
     features = CameraFeatures.unstack(stacked)
 
     # Prior weights, and how the cameras differ by them
@@ -250,7 +256,7 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
 
     # The silhouettes of the whole rig
     smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
-    statistics = torch.cat([mean, variance, smallest], -1)
+    statistics = torch.cat([mean, variance, *smallest], -1)
     return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
 
 
@@ -297,7 +303,7 @@ def _average_all(*groups: Sequence[_Boxes]) -> list[list[np.ndarray]]:
 def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     """The reference of `sample_fill_rays`."""
     shape_side, half_colour_side, silhouette_side = _box_sides(*sources.mask_sums)
-    projected, in_silhouettes = _project_into_all(rays, sources)
+    projected, cosines, in_silhouettes = _project_into_all(rays, sources)
 
     # Images, with the proxy's depth as the last channel, and means of colours and of shapes over boxes
     images = torch.cat([sources.images.float(), sources.views.depth[:, None]], 1)
@@ -310,9 +316,9 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     surface = 255 * covered_depth / coverage.clamp_min(MIN_COVERAGE)  # depths were divided by 255, too
     distance = projected.z_m - surface[..., 0]
     behind = distance * (coverage[..., 0] > MIN_COVERAGE)
-    features = _camera_features(rays, sources, projected, fine, around, behind, torch.tanh)
+    features = _camera_features(rays, sources, projected, cosines, fine, around, behind, torch.tanh)
 
-    smallest = _smallest_rig_masks(sources, in_silhouettes, silhouette_side)
+    smallest = torch.cat(_smallest_rig_masks(sources, in_silhouettes, silhouette_side), -1)
     return RaySamples(
         features, 0 * features[..., 0], F.pad(smallest, (NUM_STATISTICS - smallest.shape[-1], 0))
     )
@@ -349,6 +355,7 @@ def _camera_features(
     rays: Rays,
     sources: SourceCameras,
     projected: Projections,
+    cosines: Float[Tensor, "ray sample view"],
     fine: Float[Tensor, "ray sample view 4"],
     wide: Float[Tensor, "ray sample view 5"],
     behind: Float[Tensor, "ray sample view"],
@@ -356,15 +363,15 @@ def _camera_features(
     chosen: Int[Tensor, "ray view"] | None = None,
 ) -> Float[Tensor, "ray sample view 14"]:
     """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy, metres."""
-    cosines = viewing_cosines(rays, sources.cameras, chosen).float()
     is_source = sources.is_source(rays.view.source_views)
     if chosen is not None:
         is_source = is_source[chosen][:, None]
     is_source = is_source.expand_as(cosines)
     in_view = projected.in_view.float()[..., None]
-    relative = [behind / (saturation * rays.scale.size_m) for saturation in (NEAR, FAR)]
-    differences = squash(torch.stack(relative, -1)).float()
-    features = torch.cat([fine, differences, cosines[..., None], is_source[..., None], in_view, wide], -1)
+    saturation = rays.scale.size_m * torch.tensor((NEAR, FAR), dtype=torch.double)
+    differences = squash(behind[..., None] / saturation.to(behind.device))
+    measured = torch.cat([differences, cosines[..., None]], -1).float()
+    features = torch.cat([fine, measured, is_source[..., None], in_view, wide], -1)
     return features * in_view
 
 
@@ -427,50 +434,91 @@ def _without_ties(scores: Float[Tensor, "ray camera"]) -> Float[Tensor, "ray cam
 
 def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
     """The reference of the scores of `choose_cameras`."""
-    projected = project_rays(rays, sources.cameras)
+    lines = CameraLines.of(rays, sources.cameras)
+    projected = lines.project()
     near = F.softsign(_distance_behind(sources, projected) / (NEAR * rays.scale.size_m))
-    return (projected.in_view * _closeness(viewing_cosines(rays, sources.cameras), near)).sum(1).float()
+    return (projected.in_view * _closeness(lines.viewing_cosines(), near)).sum(1).float()
 
 
-def project_lines(
-    rays: Rays, cameras: Cameras
-) -> tuple[Float[Tensor, "view ray 3"], Float[Tensor, "view 3"]]:
-    """Rays in homogeneous image coordinates of every camera: their step per metre of z-depth, and their start."""
+class CameraLines(NamedTuple):
+    """Rays as lines in the image of every camera, or of those chosen for each ray; in double precision.
+
+    b is the step along a ray per metre of z-depth, and c leads from a camera to the viewer.
+    """
+
+    rays: Rays
+    step: Float[Tensor, "ray view 4"]
+    """Step per metre in homogeneous image coordinates, and b c."""
+    constants: Float[Tensor, "*ray view 7"]
+    """Start in homogeneous image coordinates; the image's width and height, and infinity; and c c."""
+
+    @classmethod
+    def of(cls, rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] | None = None) -> "CameraLines":
+        """The lines in these cameras."""
+        linear, start = _projection_from(rays.origin, cameras)
+        host = _on_host(cameras)
+        c = rays.origin - host.centers.double()
+        end = F.pad(host.size_px.double(), (0, 1), value=torch.inf)
+        numbers = [linear.flatten(1), c, start, end, c.square().sum(-1, keepdim=True)]
+        in_one_copy = torch.cat(numbers, 1).to(rays.z_m.device)
+        step = rays.directions @ in_one_copy[:, :12].unflatten(1, (4, 3)).mT
+        step = step.movedim(0, 1)
+        constants = in_one_copy[:, 12:]
+        if chosen is not None:
+            step = step.gather(1, chosen[..., None].expand(-1, -1, 4))
+            constants = constants[chosen]
+        return cls(rays, step, constants)
+
+    def first(self, count: int) -> "CameraLines":
+        """Those in the first cameras."""
+        return CameraLines(self.rays, self.step[:, :count], self.constants[..., :count, :])
+
+    def project(self) -> Projections:
+        """The position of every sample."""
+        z = self.rays.z_m[:, :, None, None]
+        start, end, _ = self.constants.unsqueeze(-3).split((3, 3, 1), -1)
+        uvw = torch.addcmul(start, self.step[:, None, :, :3], z)
+        uvw[..., :2].div_(uvw[..., 2:].clamp_min(1e-6))
+        in_view = ((uvw >= 0) & (uvw < end)).all(-1) & (z > 0)[..., 0]
+        visible = uvw * in_view[..., None]
+        return Projections(uv_px=visible[..., :2], z_m=visible[..., 2], in_view=in_view)
+
+    def viewing_cosines(self) -> Float[Tensor, "ray sample view"]:
+        """Cosine of the angle at each sample between the viewer and each camera.
+
+        Seen from the viewer, the sample lies along z b, and so it lies along v = z b + c seen from the camera. The
+        square of the product of both lengths is that of v b plus that of the vector product v x b. This is c x b,
+        which all samples of a ray share.
+        """
+        z = self.rays.z_m[..., None]
+        b_b = self.rays.directions.square().sum(-1)[:, None]
+        b_c = self.step[..., 3]
+        across = torch.addcmul(b_b * self.constants[..., 6], b_c, b_c, value=-1).clamp_min(1e-24)
+        along = torch.addcmul(b_c[:, None], z, b_b[:, None])
+        return along * torch.addcmul(across[:, None], along, along).rsqrt()
+
+
+def _projection_from(
+    origin: Float[Tensor, "3"], cameras: Cameras
+) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 3"]]:
+    """From a step in world coordinates to one in homogeneous image coordinates, and the origin in these; on the CPU."""
     P = _on_host(cameras).projection
     linear = P[:, :, :3]
-    start = linear @ rays.origin + P[:, :, 3]
-    directions = rays.directions
-    if directions.device.type == "cpu":
-        return directions @ linear.mT, start
-    linear_and_start = torch.cat([linear, start[..., None]], -1).to(directions.device)  # in one copy
-    return directions @ linear_and_start[..., :3].mT, linear_and_start[..., 3]
-
-
-def project_rays(rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] | None = None) -> Projections:
-    """Projects every sample into every camera, or into those chosen for its ray, in double precision."""
-    per_metre, start = project_lines(rays, cameras)
-    per_metre = per_metre.movedim(0, 1)
-    size = _on_host(cameras).size_px.double().to(start.device)
-    if chosen is not None:
-        per_metre = per_metre.gather(1, chosen[..., None].expand(-1, -1, 3))
-        start = start[chosen][:, None]
-        size = size[chosen][:, None]
-    z = rays.z_m[..., None]
-    projected = torch.addcmul(start, per_metre[:, None], z[..., None])
-    w = projected[..., 2]
-    uv = projected[..., :2] / w.clamp_min(1e-6)[..., None]
-    in_view = (z > 0) & (w > 1e-6) & ((uv >= 0) & (uv < size)).all(-1)
-    return Projections(uv_px=uv * in_view[..., None], z_m=w * in_view, in_view=in_view)
+    return linear, linear @ origin + P[:, :, 3]
 
 
 def _project_into_all(
     rays: Rays, sources: SourceCameras, chosen: Int[Tensor, "ray view"] | None = None
-) -> tuple[Projections, Projections]:
-    """Projections into the source cameras, or those chosen for each ray, and into the cameras of the silhouettes."""
+) -> tuple[Projections, Float[Tensor, "ray sample view"], Projections]:
+    """Projections into the source cameras, or those chosen for each ray, with their viewing cosines, and into the rig.
+
+    The rig are the cameras of the silhouettes.
+    """
     source_cameras = sources.cameras
     rig = sources.silhouettes.cameras
     if torch.compiler.is_exporting():  # an exported model cannot split an unknown number of cameras
-        return project_rays(rays, source_cameras, chosen), project_rays(rays, rig)
+        lines = CameraLines.of(rays, source_cameras, chosen)
+        return lines.project(), lines.viewing_cosines(), CameraLines.of(rays, rig).project()
 
     # Project into all of them at once. The silhouettes' cameras come after the source cameras.
     num_sources = source_cameras.K.shape[0]
@@ -479,36 +527,13 @@ def _project_into_all(
     if chosen is not None:
         rig_index = torch.arange(num_sources, num_sources + num_rig, device=chosen.device)
         index = torch.cat([chosen, rig_index.expand(len(chosen), -1)], 1)
-    together = project_rays(rays, concatenate_cameras([_on_host(source_cameras), _on_host(rig)]), index)
+    together = CameraLines.of(rays, concatenate_cameras([_on_host(source_cameras), _on_host(rig)]), index)
 
     # Split the projections
     counts = [num_sources if chosen is None else chosen.shape[1], num_rig]
-    of_images, of_silhouettes = zip(*(values.split(counts, 2) for values in together), strict=True)
-    return Projections(*of_images), Projections(*of_silhouettes)
-
-
-def viewing_cosines(
-    rays: Rays, cameras: Cameras, chosen: Int[Tensor, "ray view"] | None = None
-) -> Float[Tensor, "ray sample view"]:
-    """Cosine of the angle at each sample between the viewer and each camera, or those chosen for each ray.
-
-    Seen from the viewer, the sample lies along z b (b is the ray), and so it lies along z b + c seen from the
-    camera, where c leads from the camera to the viewer. All samples of a ray share b b, b c and c c.
-    """
-    ray = rays.directions
-    z = rays.z_m[..., None]
-    to_viewer = rays.origin - _on_host(cameras).centers.double()
-    c_and_square = torch.cat([to_viewer, to_viewer.square().sum(-1, keepdim=True)], 1).to(ray.device)
-    b_c = ray @ c_and_square[:, :3].T
-    b_b = ray.square().sum(-1)[:, None, None]
-    c_c = c_and_square[:, 3]
-    if chosen is not None:
-        b_c = b_c.gather(1, chosen)
-        c_c = c_c[chosen][:, None]
-    b_c = b_c[:, None]
-    along = torch.addcmul(b_c, z, b_b)
-    squared_length = torch.addcmul(c_c, z, along + b_c)
-    return along * (squared_length * b_b).clamp_min(1e-24).rsqrt()
+    split = zip(*(values.split(counts, 2) for values in together.project()), strict=True)
+    of_images, of_silhouettes = (Projections(*parts) for parts in split)
+    return of_images, together.first(counts[0]).viewing_cosines(), of_silhouettes
 
 
 def sample_level(
@@ -522,7 +547,7 @@ def sample_level(
     whole = position.long()
     share = (position - whole).float()
     column, row = whole.unbind(-1)
-    offset = row * levels.columns + column
+    offset = torch.addcmul(column, row, levels.columns)
     pixels = levels.pixels[:, :channels]
     if torch.compiler.is_exporting():
         upper, lower = (offset + first for first in levels.first.unbind(-1))
@@ -597,7 +622,7 @@ def _box_sides(
 
 def _smallest_rig_masks(
     sources: SourceCameras, projected: Projections, side: Int[Tensor, ""]
-) -> Float[Tensor, "ray sample 4"]:
+) -> Sequence[Float[Tensor, "ray sample 2"]]:
     """The smallest masks of all cameras of the rig, single and averaged over boxes of this side."""
     masks = sources.silhouettes.mask[:, None].float()
     silhouettes = _sample_with_means(masks, [(1, side)], projected)
@@ -606,12 +631,11 @@ def _smallest_rig_masks(
 
 def _smallest_masks(
     projected: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
-) -> Float[Tensor, "ray sample 4"]:
+) -> Sequence[Float[Tensor, "ray sample 2"]]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
-    seen = torch.where(projected.in_view, masks, 1.0)
+    seen = masks.masked_fill(~projected.in_view, 1.0)
     at_least_two = F.pad(seen, (0, 1), value=1.0)
-    of_masks, of_means = at_least_two.topk(2, largest=False).values
-    return torch.cat([of_masks, of_means], -1)
+    return at_least_two.topk(2, largest=False).values.unbind(0)
 
 
 def _sample_numba(
@@ -697,8 +721,9 @@ def _score_numba(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camer
 
 
 def _lines(rays: Rays, cameras: Cameras) -> list[tuple]:
-    """`project_lines` and the image size of each camera."""
-    per_metre, start = project_lines(rays, cameras)
+    """The step per metre and the start in homogeneous image coordinates, and the image size, of each camera."""
+    linear, start = _projection_from(rays.origin, cameras)
+    per_metre = rays.directions @ linear.mT
     sizes = [tuple(size) for size in cameras.size_px.tolist()]
     return list(zip(per_metre.numpy(), start.numpy(), sizes, strict=True))
 
