@@ -24,10 +24,8 @@ CANDIDATES = 1 << 22
 
 EMPTY = -1
 """The rasteriser in torch gives this key to pixels without a surface."""
-FACE_BITS = 0x7FFFFFFF
-"""These bits of a key hold the index of its face, subtracted from `LAST_FACE`."""
-LAST_FACE = FACE_BITS - 1
-"""Indices of faces are at most this, so that those of `EMPTY` mean -1."""
+FIRST_FACE = -2
+"""The lower half of a key is this, minus the index of its face: that of `EMPTY` means -1."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,8 @@ class Raster:
     """z-depth in metres, 0 where there is no surface."""
     triangle: Int[Tensor, "view height width"]
     """Index into the mesh's faces (int32), -1 where there is no surface."""
+    planes: Float[Tensor, "view face 3 3"] | None = None
+    """The `corner_planes` of all faces, if the rasteriser in torch has computed them."""
 
 
 @one_thread()
@@ -96,16 +96,22 @@ def interpolate(
     views, height, width = raster.triangle.shape
     if not len(mesh.faces):
         return attributes.new_zeros(views, height, width, attributes.shape[1])
+    planes = raster.planes
+    if planes is None:
+        planes, _ = corner_planes(homogeneous(mesh.vertices, cameras)[:, mesh.faces.long()])
+
+    # the attributes and 1, all divided by z, are planes over each triangle
+    of_vertices = F.pad(attributes, (0, 1), value=1.0).double()
+    over_z = of_vertices[mesh.faces.long()].mT @ planes
+
     # all pixels, those without a surface with any triangle: to find the others would wait for the device
-    covered = raster.triangle >= 0
-    corners = mesh.faces[raster.triangle.clamp(min=0).long()].long()
-    view = torch.arange(views, device=corners.device)[:, None, None, None]
-    edges = edge_functions(homogeneous(mesh.vertices, cameras)[view, corners])
-    uv1 = F.pad(pixel_centers(width, height, corners.device), (0, 1), value=1.0).double()
-    values = (edges @ uv1[..., None])[..., 0]
-    total = values.sum(-1, keepdim=True).masked_fill(~covered[..., None], 1.0)
-    weights = (values / total).to(attributes)
-    return (weights[..., None, :] @ attributes[corners])[..., 0, :] * covered[..., None]
+    view = torch.arange(views, device=planes.device)[:, None, None]
+    across, down, start = over_z[view, raster.triangle.clamp(min=0).long()].unbind(-1)
+    u = torch.arange(0.5, width, dtype=torch.double, device=planes.device)[:, None]
+    v = torch.arange(0.5, height, dtype=torch.double, device=planes.device)[:, None, None]
+    values = torch.addcmul(torch.addcmul(start, down, v), across, u)
+    found = (values[..., :-1] / values[..., -1:]).to(attributes)
+    return found.masked_fill((raster.triangle < 0)[..., None], 0.0)
 
 
 def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster):
@@ -131,12 +137,20 @@ def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster):
 def homogeneous(vertices: Float[Tensor, "vertex 3"], cameras: Cameras) -> Float[Tensor, "view vertex 3"]:
     """P X of every vertex in every camera, in float64: (u z, v z, z) with u, v in pixels."""
     P = cameras.projection
-    return torch.einsum("vij,nj->vni", P[:, :, :3], vertices.double()) + P[:, None, :, 3]
+    return torch.baddbmm(P[:, None, :, 3], vertices.double().expand(len(P), -1, -1), P[:, :, :3].mT)
 
 
-def edge_functions(corners: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Edge i of each triangle as the plane q_j x q_k over (u, v, 1); corner by corner in dim -2."""
-    return torch.linalg.cross(corners.roll(-1, -2), corners.roll(-2, -2))
+def corner_planes(
+    corners: Float[Tensor, "*face 3 3"],
+) -> tuple[Float[Tensor, "*face 3 3"], Float[Tensor, "*face"]]:
+    """The weight of each corner over its triangle, divided by z, as a plane over (u, v, 1); and the determinants.
+
+    The corners q are homogeneous. A triangle without an area has a determinant of 0, and planes that are not finite.
+    """
+    around = torch.cat([corners, corners[..., :2, :]], -2)
+    edges = torch.linalg.cross(around[..., 1:4, :], around[..., 2:5, :])  # edge i is q_j x q_k
+    determinant = (corners[..., 0, :] * edges[..., 0, :]).sum(-1)
+    return edges / determinant[..., None, None], determinant
 
 
 def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
@@ -145,43 +159,46 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
     """
     width, height = cameras.max_size_px
+    views = len(cameras)
     corners = homogeneous(mesh.vertices, cameras)[:, mesh.faces.long()]
-    edges = edge_functions(corners)
-    determinant = (corners[..., 0, :] * edges[..., 0, :]).sum(-1)
-    low, high = _pixel_boxes(corners, cameras.size_px)
+    planes, determinant = corner_planes(corners)
+    low, extent = _pixel_boxes(corners, cameras.size_px)
+    if cull:
+        extent = extent * (determinant * cull <= 0)[..., None]
 
-    # Every triangle of every view has a box of pixels. Only the total number of pixels is read from
-    # the device. Edges become weights of the corners, which are 1/z at the corners' own pixels.
-    keep = (low <= high).all(-1) & (determinant * cull <= 0)
-    extent = ((high - low + 1) * keep[..., None]).flatten(0, 1)
-    low = low.flatten(0, 1)
-    weights = (edges / determinant[..., None, None]).flatten(0, 1)
-    area = extent.prod(-1)
+    # Every triangle of every view has a box of pixels. Only the total number of pixels is read from the device
+    area = extent.prod(-1).flatten()
     ends = area.cumsum(0)
+    device = ends.device
+    faces = torch.arange(FIRST_FACE, FIRST_FACE - len(mesh.faces), -1, device=device).expand(views, -1)
+    first_pixel = torch.arange(0, views * height * width, height * width, device=device)
+    columns = [(ends - area).view_as(faces), extent[..., 0], faces, first_pixel[:, None].expand_as(faces)]
+    boxes = torch.cat([torch.stack(columns, -1), low], -1).flatten(0, 1)
 
-    # The key orders by 1/z, then by the lower id: positive floats order like their bits.
-    keys = torch.full((len(cameras) * height * width,), EMPTY, dtype=torch.long, device=ends.device)
-    for part, pixels in _portions(ends):
-        box, uv = _candidate_pixels(low[part], extent[part], area[part], pixels)
-        inverse, visible = _inverse_depth(weights[part][box], uv)
-        box = box + part.start
-        key = (inverse.view(torch.int32).long() << 32) | (LAST_FACE - box % len(mesh.faces))
-        key = key.masked_fill(~visible, EMPTY)
-        # box // len(mesh.faces) is the view
-        keys.scatter_reduce_(0, (box // len(mesh.faces) * height + uv[:, 1]) * width + uv[:, 0], key, "amax")
+    # A key holds the face and 1/z; the largest orders by 1/z, then by the lower face: positive floats order
+    # like their bits
+    keys = torch.full((views * height * width,), EMPTY, dtype=torch.long, device=device)
+    for part, begin, pixels in _portions(ends):
+        box = torch.repeat_interleave(area[part], output_size=pixels)
+        face, pixel, uv = _candidate_pixels(boxes[part][box], begin, width)
+        inverse = _inverse_depth(planes.flatten(0, 1)[part][box], uv)
+        key = torch.stack([face.int(), inverse.view(torch.int32)], -1).view(torch.long)[:, 0]
+        keys.scatter_reduce_(0, pixel, key, "amax")
 
-    return _unpack_keys(keys.view(len(cameras), height, width))
+    depth, triangle = _unpack_keys(keys.view(views, height, width))
+    return Raster(depth, triangle, planes)
 
 
-def _unpack_keys(keys: Int[Tensor, "view height width"]) -> Raster:
+def _unpack_keys(
+    keys: Int[Tensor, "view height width"],
+) -> tuple[Float[Tensor, "view height width"], Int[Tensor, "view height width"]]:
     """Depth and triangle of each pixel from its key. `EMPTY` becomes triangle -1, and its upper half is NaN."""
-    triangle = (LAST_FACE - (keys & FACE_BITS)).int()
-    inverse = (keys >> 32).int().view(torch.float32)
-    return Raster(inverse.reciprocal().nan_to_num(0.0), triangle)
+    face, inverse = keys.view(torch.int32).unflatten(-1, (-1, 2)).unbind(-1)
+    return inverse.view(torch.float32).reciprocal().nan_to_num(0.0), FIRST_FACE - face
 
 
-def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
-    """Boxes whose pixels are drawn at once, at most about `CANDIDATES`, and how many pixels they have.
+def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int, int]]:
+    """Boxes whose pixels are drawn at once, at most about `CANDIDATES`, their first pixel and how many they have.
 
     `ends` counts the pixels up to the end of each box. One portion, if that is enough, waits for
     the device only once.
@@ -189,7 +206,7 @@ def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
     total = int(ends[-1]) if len(ends) else 0
     if total <= CANDIDATES:
         if total:
-            yield slice(0, len(ends)), total
+            yield slice(0, len(ends)), 0, total
         return
     on_host = ends.cpu()
     first = 0
@@ -198,45 +215,56 @@ def _portions(ends: Int[Tensor, "box"]) -> Iterator[tuple[slice, int]]:
         last = max(first + 1, int(torch.searchsorted(on_host, begin + CANDIDATES, right=True)))
         pixels = int(on_host[last - 1]) - begin
         if pixels:
-            yield slice(first, last), pixels
+            yield slice(first, last), begin, pixels
         first = last
 
 
 def _pixel_boxes(
     corners: Float[Tensor, "view face 3 3"], size_px: Int[Tensor, "view 2"]
 ) -> tuple[Int[Tensor, "view face 2"], Int[Tensor, "view face 2"]]:
-    """First and last pixel whose centre may be in each triangle; the whole image for one that crosses z = near."""
-    in_front = (corners[..., 2] > NEAR_M).sum(-1)[..., None]
-    crossing = in_front < 3
+    """First pixel and numbers of columns and rows of those whose centres may be in each triangle.
+
+    That is the whole image for a triangle that crosses z = near, and no pixel for one behind it.
+    """
+    nearest_m, farthest_m = corners[..., 2].aminmax(dim=2, keepdim=True)
+    crossing = nearest_m <= NEAR_M
     uv = corners[..., :2] / corners[..., 2:].clamp_min(NEAR_M)
     first, last = uv.aminmax(dim=2)
-    image_end = size_px[:, None].double() - 1
-    low = (first - 0.5).ceil().clamp_min(0)
-    high = (last - 0.5).floor().minimum(image_end)
-    low = low.masked_fill(crossing, 0)
-    high = torch.where(crossing, image_end, high).masked_fill(in_front == 0, -1)
-    return low.long(), high.long()
+    image_end = size_px[:, None]
+    low = (first - 0.5).ceil().clamp_min(0).masked_fill(crossing, 0)
+    end = torch.where(crossing, image_end, (last + 0.5).floor().minimum(image_end))
+    extent = (end - low).clamp_min(0).masked_fill(farthest_m <= NEAR_M, 0)
+    return low.long(), extent.long()
 
 
 def _candidate_pixels(
-    low: Int[Tensor, "box 2"], extent: Int[Tensor, "box 2"], area: Int[Tensor, "box"], pixels: int
-) -> tuple[Int[Tensor, "candidate"], Int[Tensor, "candidate 2"]]:
-    """Every pixel of every box, with the index of its box; there are `pixels` of them."""
-    box = torch.repeat_interleave(area, output_size=pixels)
-    first = area.cumsum(0) - area
-    within = torch.arange(pixels, device=area.device) - first[box]
-    columns = extent[box, 0]
-    return box, low[box] + torch.stack([within % columns, within // columns], -1)
+    boxes: Int[Tensor, "candidate 6"], begin: int, width: int
+) -> tuple[Int[Tensor, "candidate"], Int[Tensor, "candidate"], Int[Tensor, "candidate 2"]]:
+    """Half a key, index in all images, and column and row, of every pixel of every box.
+
+    Args:
+        boxes: each candidate's box: its first candidate, its number of columns, its half of the key, the
+            first pixel of its view, and its own first column and row.
+        begin: the first of these candidates.
+        width: of the images, pixels.
+    """
+    first, columns, face, of_view, *_ = boxes.unbind(1)
+    within = torch.arange(begin, begin + len(boxes), device=boxes.device) - first
+    uv = boxes[:, 4:] + torch.stack([within % columns, within // columns], -1)
+    return face, of_view + uv[:, 1] * width + uv[:, 0], uv
 
 
 def _inverse_depth(
-    weights: Float[Tensor, "candidate 3 3"], uv: Int[Tensor, "candidate 2"]
-) -> tuple[Float[Tensor, "candidate"], Bool[Tensor, "candidate"]]:
-    """1/z of the triangle at each pixel's centre, float32, and whether the centre is inside it and z > near.
+    planes: Float[Tensor, "candidate 3 3"], uv: Int[Tensor, "candidate 2"]
+) -> Float[Tensor, "candidate"]:
+    """1/z of the triangle at each pixel's centre, float32; below 0 if the centre is not inside it, or z is too small.
 
-    `weights` are the triangle's edges, divided by its determinant; not finite for one without an area.
+    `planes` are the `corner_planes` of the triangle.
     """
     u, v = (uv + 0.5).unsqueeze(1).unbind(-1)
-    value = weights[..., 0] * u + (weights[..., 1] * v + weights[..., 2])
+    across, down, start = planes.unbind(-1)
+    value = torch.addcmul(torch.addcmul(start, down, v), across, u)
     inverse = value.sum(-1).float()
-    return inverse, (value >= 0).all(-1) & (inverse > 0) & (inverse * NEAR_M < 1)
+    in_range = inverse.clamp(torch.finfo(inverse.dtype).tiny, 1 / NEAR_M)
+    hidden = (value < 0).any(-1) | (inverse != in_range)  # nothing equals NaN, of a triangle without an area
+    return inverse.masked_fill(hidden, -1.0)
