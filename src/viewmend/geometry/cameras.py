@@ -147,6 +147,15 @@ class Cameras(OnDevice):
         with torch.inference_mode(False):
             return torch.linalg.inv_ex(self.K).inverse
 
+    @cached_property
+    def world_from_pixel(self) -> Float[Tensor, "view 3 3"]:
+        """From homogeneous pixel coordinates to rays of z = 1 in the camera's axes, in world axes."""
+        if self.K.device.type != "cpu":
+            return self.on_host.world_from_pixel.to(self.K.device)
+        with torch.inference_mode(False):
+            rotation = self.world_from_camera[:, :3, :3].double()
+            return (rotation @ torch.linalg.inv_ex(self.K.double()).inverse).to(self.K)
+
     @property
     def centers(self) -> Float[Tensor, "view 3"]:
         """Camera centres in world coordinates, metres."""
@@ -235,7 +244,7 @@ def project(
     A point behind a camera has z <= 0; its pixel coordinates are meaningless (but finite): test z.
     """
     P = cameras.K @ cameras.camera_from_world[:, :3]
-    homogeneous = torch.einsum("vij,pj->vpi", P[:, :, :3], points_world) + P[:, None, :, 3]
+    homogeneous = torch.baddbmm(P[:, None, :, 3], points_world.expand(len(P), -1, -1), P[:, :, :3].mT)
     z = homogeneous[..., 2]
     safe = z.masked_fill(z.abs() < 1e-9, 1e-9)
     return homogeneous[..., :2] / safe[..., None], z
@@ -245,9 +254,8 @@ def unproject(
     uv_px: Float[Tensor, "view point 2"], z_m: Float[Tensor, "view point"], cameras: Cameras
 ) -> Float[Tensor, "view point 3"]:
     """World points at these pixels and z-depths, each in its own camera; inverse of `project`."""
-    rays = torch.einsum("vij,vpj->vpi", cameras.camera_from_pixel, F.pad(uv_px, (0, 1), value=1.0))
-    world = cameras.world_from_camera
-    return torch.einsum("vij,vpj->vpi", world[:, :3, :3], rays * z_m[..., None]) + world[:, None, :3, 3]
+    rays = F.pad(uv_px, (0, 1), value=1.0) @ cameras.world_from_pixel.mT
+    return torch.addcmul(cameras.centers[:, None], rays, z_m[..., None])
 
 
 def pixel_centers(

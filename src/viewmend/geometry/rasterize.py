@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.cameras import Cameras, pixel_centers
+from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.threads import one_thread, parallel_for
 

@@ -25,7 +25,7 @@ def in_view(
     uv_px: Float[Tensor, "view point 2"], z_m: Float[Tensor, "view point"], cameras: Cameras
 ) -> Bool[Tensor, "view point"]:
     """Which points, projected to `uv_px` at z-depth `z_m`, lie in front of each camera and inside its image."""
-    return (z_m > 0) & (uv_px >= 0).all(-1) & (uv_px < cameras.size_px[:, None]).all(-1)
+    return (z_m > 0) & ((uv_px >= 0) & (uv_px < cameras.size_px[:, None])).all(-1)
 
 
 def bilinear_taps(uv_px: Float[Tensor, "view point 2"], cameras: Cameras) -> BilinearTaps:
@@ -38,9 +38,9 @@ def bilinear_taps(uv_px: Float[Tensor, "view point 2"], cameras: Cameras) -> Bil
     clamped = _clamped(uv_px, width, height) - 0.5
     first = clamped.floor()
     share = clamped - first
-    corner = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], device=uv_px.device)[:, None, None]
-    place = first.long() + corner
-    weight = torch.where(corner > 0, share, 1 - share).prod(-1)
+    corner = uv_px.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None, None]
+    place = (first + corner).long()
+    weight = torch.lerp(1 - share, share, corner).prod(-1)
     column, row = place.clamp(min=0).minimum(size - 1).unbind(-1)
     return BilinearTaps(row, column, weight)
 

@@ -1,11 +1,13 @@
 """Image-based blending of a few cameras on the surface of a novel view (RIFTCast, section 3.3)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
@@ -50,6 +52,11 @@ class Blend:
     """Raw weights, not normalised."""
     disagreement: Float[Tensor, "height width"]
     """Weighted standard deviation of the samples, mean of the channels; 0 for a single camera."""
+
+    @cached_property
+    def total_weight(self) -> Float[Tensor, "height width"]:
+        """The sum of the weights."""
+        return self.weights.sum(0)
 
 
 def blend(
@@ -139,12 +146,11 @@ def blend_torch(
     # for the device
     uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device).view(1, -1, 2)
     covered = depth.flatten() > 0
-    points = unproject(uv_px, torch.where(covered, depth.flatten(), 1.0)[None], camera)[0]
-    normal = normalize(normals.flatten(0, 1), dim=-1)
-    to_viewer = normalize(camera.centers[0] - points, dim=-1)
+    points = unproject(uv_px, F.threshold(depth.flatten(), 0.0, 1.0)[None], camera)[0]
+    directions = normalize(torch.stack([normals.flatten(0, 1), camera.centers[0] - points], 1), dim=-1)
 
     # each camera's colour and weight there
-    weight, colour = _sample(points, normal, to_viewer, sources, bias_m, config)
+    weight, colour = _sample(points, directions, sources, bias_m, config)
     weight = weight * covered
 
     # their weighted mean and variance
@@ -156,19 +162,17 @@ def blend_torch(
 
 def _sample(
     points: Float[Tensor, "point 3"],
-    normal: Float[Tensor, "point 3"],
-    to_viewer: Float[Tensor, "point 3"],
+    directions: Float[Tensor, "point 2 3"],
     sources: ContextViews,
     bias_m: float,
     config: BlendConfig,
 ) -> tuple[Float[Tensor, "view point"], Float[Tensor, "view 3 point"]]:
-    """Weight and colour of each camera at each surface point."""
+    """Weight and colour of each camera at each surface point; `directions` are the normal and that to the viewer."""
     frame = sources.frame
     rig = frame.cameras
     uv, z = project(points, rig)
     to_camera = normalize(rig.centers[:, None] - points, dim=-1)
-    facing = (normal * to_camera).sum(-1).clamp(0, 1)
-    agreeing = (to_viewer * to_camera).sum(-1).clamp(0, 1)
+    facing, agreeing = (directions @ to_camera.movedim(0, 2)).clamp(0, 1).movedim(0, 2).unbind(0)
 
     # Change of depth of a surface at this angle from one pixel of the camera to the next.
     focal = rig.K[:, 0, 0, None]

@@ -56,7 +56,7 @@ class Evidence:
 
 def holes(evidence: Evidence) -> Float[Tensor, "height width"]:
     """1 on the pixels of the proxy that no source view colours: the paper's E, with RIFTCast's threshold."""
-    return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
+    return evidence.mask * (evidence.blend.total_weight < MIN_WEIGHT)
 
 
 def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:

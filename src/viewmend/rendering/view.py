@@ -160,7 +160,7 @@ def _colour(
     coloured = mask - uncoloured
 
     # normalise the cameras' weights to a sum of 1
-    total = blended.weights.sum(0)
+    total = blended.total_weight
     weights = blended.weights / total.clamp(min=torch.finfo(total.dtype).tiny) * coloured
 
     silhouettes = None if usable.mask is None else Silhouettes(usable.mask, usable.cameras)

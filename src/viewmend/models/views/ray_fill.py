@@ -210,12 +210,11 @@ class RayFill(Network, Fill):
         """The mixed colour of some pixels; `far` are the features of their neighbourhoods."""
         colours, points = self._points(features, smallest_masks)
         hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
-        in_any_view = CameraFeatures.unstack(features).in_view.amax((2, 3)) > 0
-        available = F.pad(in_any_view, (0, 2), value=True)  # the smooth fill and background always are
-        weights = self.choose(hidden).float().masked_fill(~available, -torch.inf).softmax(1)
-        smooth = window[:, None, -3:, RADIUS_PX, RADIUS_PX]
-        candidates = torch.cat([colours, smooth, torch.zeros_like(smooth)], 1)
-        return (weights[..., None] * candidates).sum(1)
+        in_no_view = CameraFeatures.unstack(features).in_view.amax((2, 3)) == 0
+        missing = F.pad(in_no_view, (0, 2), value=False)  # the smooth fill and background never are
+        weights = self.choose(hidden).float().masked_fill(missing, -torch.inf).softmax(1)
+        candidates = torch.cat([colours, window[:, None, -3:, RADIUS_PX, RADIUS_PX]], 1)
+        return (weights[:, :-1, None] * candidates).sum(1)  # background is black
 
     def _points(
         self, features: Features, smallest_masks: SmallestMasks
@@ -257,12 +256,11 @@ class RayFill(Network, Fill):
         first = self.compare[0]
         assert isinstance(first, nn.Linear)
         widths = (ordered.shape[-1], COLOUR_CHANNELS, COLOUR_CHANNELS, looked.shape[-1], 2, 1)
-        of_camera, of_mean, of_variance, of_look, of_masks, of_prior = first.weight.split(widths, 1)
+        of_camera, *_, of_look, _, of_prior = first.weight.split(widths, 1)
         own = F.linear(torch.cat([ordered, looked, prior], -1), torch.cat([of_camera, of_look, of_prior], 1))
         together = (prior * looked).sum(2)
         shared = torch.cat([mean[:, :, 0], variance[:, :, 0], together, smallest_masks[:, :, ::2]], -1)
-        shared_weight = torch.cat([of_mean, of_variance, of_look, of_masks], 1)
-        added = F.linear(shared, shared_weight, first.bias)
+        added = F.linear(shared, first.weight[:, ordered.shape[-1] : -1], first.bias)
         return self.compare[1:](own + added[:, :, None])
 
 
@@ -340,7 +338,7 @@ def multi_scale_context(
     # Sums over boxes of the view
     if scale is None:
         scale = SceneScale.of(view)
-    depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
+    depth = (2 * (view.depth - scale.depth_m) / scale.size_m).sigmoid() * (view.depth > 0)
     sums = BoxSums.of(torch.cat([smooth, view.mask[None], view.error[None], depth[None]])[None])
 
     # The cells of each size that pixels are in, the first of which begin `before` pixels outside the view
