@@ -72,7 +72,8 @@ class SampleAggregator(nn.Module):
         with torch.autocast(features.device.type, enabled=False):  # colours need more than eight bits
             mean = _weighted_sum(trust, features)
             square = _weighted_sum(trust, features[..., COLOUR].square())
-        variance = CONTRAST * (square - mean[..., COLOUR].square()).clamp_min(0)
+        colour = mean[..., COLOUR]
+        variance = CONTRAST * torch.addcmul(square, colour, colour, value=-1).clamp_min(0)
         certainty = trust.square().sum(2, keepdim=True)
         out = self.sample(torch.cat([summary.float(), mean, variance, statistics, certainty], -1))
         return AggregatedSamples(mean[..., RGBA], out[..., :-1], out[..., -1], trust)

@@ -231,9 +231,9 @@ class RayFill(Network, Fill):
         # What the trusted cameras show, and how much they agree
         scores = self.trust(compared).float() + (prior + 1e-4).log()
         trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
-        agreed = (trust * colours).sum(2)
-        spread = CONTRAST * (trust * (colours - agreed[:, :, None]) ** 2).sum(2)
-        point = [(trust * compared).sum(2), agreed, spread, smallest_masks, (trust**2).sum(2)]
+        agreed = _weighted_sum(trust, colours)
+        spread = CONTRAST * _weighted_sum(trust, (colours - agreed[:, :, None]) ** 2)
+        point = [_weighted_sum(trust, compared), agreed, spread, smallest_masks, _weighted_sum(trust, trust)]
         return agreed[..., :3], self.point(torch.cat(point, -1))
 
     def _compare(
@@ -247,8 +247,8 @@ class RayFill(Network, Fill):
 
         The first layer runs once per point, instead of once per camera, on what the cameras share.
         """
-        mean = (prior * colours).sum(2, keepdim=True)
-        variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
+        mean = _weighted_sum(prior, colours)
+        variance = CONTRAST * _weighted_sum(prior, (colours - mean[:, :, None]) ** 2)
 
         # Shipped weights depend on the order of these channels
         ordered = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)
@@ -258,10 +258,18 @@ class RayFill(Network, Fill):
         widths = (ordered.shape[-1], COLOUR_CHANNELS, COLOUR_CHANNELS, looked.shape[-1], 2, 1)
         of_camera, *_, of_look, _, of_prior = first.weight.split(widths, 1)
         own = F.linear(torch.cat([ordered, looked, prior], -1), torch.cat([of_camera, of_look, of_prior], 1))
-        together = (prior * looked).sum(2)
-        shared = torch.cat([mean[:, :, 0], variance[:, :, 0], together, smallest_masks[:, :, ::2]], -1)
+        together = _weighted_sum(prior, looked)
+        shared = torch.cat([mean, variance, together, smallest_masks[:, :, ::2]], -1)
         added = F.linear(shared, first.weight[:, ordered.shape[-1] : -1], first.bias)
         return self.compare[1:](own + added[:, :, None])
+
+
+def _weighted_sum(
+    weights: Float[Tensor, "pixel point view 1"], values: Float[Tensor, "pixel point view value"]
+) -> Float[Tensor, "pixel point value"]:
+    """Sums over cameras, in the precision of the weights."""
+    with torch.autocast(weights.device.type, enabled=False):  # colours need more than eight bits
+        return (weights.mT @ values.to(weights)).squeeze(2)
 
 
 def _round_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
@@ -295,12 +303,23 @@ def gather_ray_inputs(
         samples = sample_behind_proxy(view, pixels, sources, scale=scale, all_have_depth=all_have_depth)
         features = samples.features
         smallest = RayStatistics.unstack(samples.statistics).smallest_masks
-    image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], smooth]), (RADIUS_PX,) * 4)
-    reach = torch.arange(2 * RADIUS_PX + 1, device=image.device)
-    rows = pixels[:, 0, None] + reach
-    columns = pixels[:, 1, None] + reach
-    window = image[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
+    window = windows(torch.cat([view.rgb, view.mask[None], view.error[None], smooth]), pixels, RADIUS_PX)
     return RayInputs(features, smallest, window, *multi_scale_context(view, smooth, pixels, scale))
+
+
+def windows(
+    image: Float[Tensor, "channel height width"], at: Int[Tensor, "point 2"], radius: int
+) -> Float[Tensor, "point channel side side"]:
+    """Squares around some pixels (row, column) of an image, which is 0 beyond its border."""
+    padded = F.pad(image, (radius,) * 4)
+    side = 2 * radius + 1
+    if torch.compiler.is_exporting():
+        reach = torch.arange(side)
+        rows = at[:, 0, None] + reach
+        columns = at[:, 1, None] + reach
+        return padded[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
+    everywhere = padded.movedim(0, 2).unfold(0, side, 1).unfold(1, side, 1)
+    return everywhere[tuple(at.unbind(1))]
 
 
 def sample_behind_proxy(
@@ -335,30 +354,45 @@ def multi_scale_context(
     Cells meet at the principal point, so that a crop of a view has the same cells. `scale` is the
     view's, if it is known.
     """
-    # Sums over boxes of the view
+    # The view
     if scale is None:
         scale = SceneScale.of(view)
-    depth = (2 * (view.depth - scale.depth_m) / scale.size_m).sigmoid() * (view.depth > 0)
-    sums = BoxSums.of(torch.cat([smooth, view.mask[None], view.error[None], depth[None]])[None])
+    depth = ((view.depth - scale.depth_m) / (0.5 * scale.size_m)).sigmoid() * (view.depth > 0)
+    image = torch.cat([smooth, view.mask[None], view.error[None], depth[None]])
 
     # The cells of each size that pixels are in, the first of which begin `before` pixels outside the view
     sides = torch.stack([box_side_px(size, scale.subject_px) for size in CELLS])[:, None]
     middle = (view.camera if torch.compiler.is_exporting() else view.camera.on_host).K[0, :2, 2]
     before = -middle.floor().long().flip(0) % sides
-    before, sides = torch.cat([before, sides], 1).to(pixels.device).split((2, 1), 1)
-    cells = (pixels[:, None] + before) // sides
     if torch.compiler.is_exporting():
+        cells = (pixels[:, None] + before) // sides
         firsts, index = _first_pixels(cells, sides, before, view.mask.shape)
-        cells = (firsts[:, None] + before) // sides
-    else:
-        cells, index = cells.unique(dim=0, return_inverse=True)
+        return _means_of_boxes(image, (firsts[:, None] + before) // sides, sides, before), index
+    on_device = torch.cat([before, sides], 1).to(pixels.device)
+    cells = (pixels[:, None] + on_device[:, :2]) // on_device[:, 2:]
+    cells, index = cells.unique(dim=0, return_inverse=True)
 
     # The means of the cells around them
-    reach = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device)
+    around = []
+    for size, (above, left, side) in enumerate(torch.cat([before, sides], 1).tolist()):
+        from_first = F.pad(image, (left, 0, above, 0))
+        means = F.avg_pool2d(from_first, side, ceil_mode=True, divisor_override=side**2)
+        around.append(windows(means, cells[:, size], CELLS_AROUND))
+    return torch.cat(around, 1), index
+
+
+def _means_of_boxes(
+    image: Float[Tensor, "6 height width"],
+    cells: Int[Tensor, "neighbourhood size 2"],
+    sides: Int[Tensor, "size 1"],
+    before: Int[Tensor, "size 2"],
+) -> Float[Tensor, "neighbourhood 12 11 11"]:
+    """The means of the cells around some cells, for an exported model, where their sides depend on the inputs."""
+    reach = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2)
     corners = (cells[..., None] + reach) * sides[..., None] - before[..., None]
     rows, columns = corners.split(1, 2)
-    means = (sums.boxes(rows, columns)[:, :, 0] / sides[..., None, None] ** 2).float()
-    return means.movedim(-1, 2).flatten(1, 2), index
+    means = (BoxSums.of(image[None]).boxes(rows, columns)[:, :, 0] / sides[..., None, None] ** 2).float()
+    return means.movedim(-1, 2).flatten(1, 2)
 
 
 def _first_pixels(

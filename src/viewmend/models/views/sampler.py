@@ -250,13 +250,13 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     # Prior weights, and how the cameras differ by them
     prior = features.in_view * _closeness(features.viewing_cosine, features.depth_difference)
     prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
-    mean = (prior * features.colour).sum(2)
-    difference = features.in_view * (features.colour - mean[:, :, None])
-    variance = CONTRAST * (prior * difference.square()).sum(2)
+    mean = prior.mT @ features.colour
+    difference = features.in_view * (features.colour - mean)
+    variance = CONTRAST * (prior.mT @ difference.square())
 
     # The silhouettes of the whole rig
     smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
-    statistics = torch.cat([mean, variance, *smallest], -1)
+    statistics = torch.cat([mean.squeeze(2), variance.squeeze(2), *smallest], -1)
     return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
 
 
