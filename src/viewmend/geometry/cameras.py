@@ -246,8 +246,7 @@ def project(
     P = cameras.K @ cameras.camera_from_world[:, :3]
     homogeneous = torch.baddbmm(P[:, None, :, 3], points_world.expand(len(P), -1, -1), P[:, :, :3].mT)
     z = homogeneous[..., 2]
-    safe = z.masked_fill(z.abs() < 1e-9, 1e-9)
-    return homogeneous[..., :2] / safe[..., None], z
+    return homogeneous[..., :2] / z.clamp_min(1e-9)[..., None], z
 
 
 def unproject(

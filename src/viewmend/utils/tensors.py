@@ -138,8 +138,14 @@ def nonzero_of(*masks: Tensor) -> list[Tensor]:
     """`torch.nonzero` of each mask; waits for a GPU only once."""
     if masks[0].device.type == "cpu":
         return [torch.nonzero(mask) for mask in masks]
-    counts = torch.stack([mask.sum() for mask in masks]).tolist()
-    return [torch.nonzero_static(mask, size=count) for mask, count in zip(masks, counts, strict=True)]
+    return [
+        torch.nonzero_static(mask, size=count) for mask, count in zip(masks, counts_of(*masks), strict=True)
+    ]
+
+
+def counts_of(*masks: Tensor) -> list[int]:
+    """How many elements of each mask are true; waits for a GPU only once."""
+    return torch.stack([mask.sum() for mask in masks]).tolist()
 
 
 def extremes(images: Iterable[Tensor]) -> list[tuple[float, float]]:

@@ -121,14 +121,9 @@ def detail_bands(
     count = colours.shape[1]
     weighted = (weight[:, None, None] * colours).flatten(1)
     image = scatter_to_image(torch.cat([weighted, weight[:, None]], 1), pixels, shape)
-    finer = colours
-    bands = []
-    for side in band_sides_px(magnification):
-        means = _box_means_at(image, side, pixels)
-        weighted_mean = (means[:, :-1] / means[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
-        bands.append(finer - weighted_mean)
-        finer = weighted_mean
-    return torch.stack(bands, 1)
+    sums = torch.stack([_box_means_at(image, side, pixels) for side in band_sides_px(magnification)], 1)
+    means = (sums[..., :-1] / sums[..., -1:].clamp_min(1e-6)).unflatten(2, (count, 3))
+    return torch.cat([colours[:, None], means[:, :-1]], 1) - means
 
 
 def band_sides_px(magnification: float | Float[Tensor, ""]) -> tuple[int | Int[Tensor, ""], ...]:

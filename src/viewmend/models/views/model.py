@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -61,7 +61,7 @@ from viewmend.models.views.prediction import (
 )
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
-from viewmend.models.views.sampler import Rays, RaySamples, RayStatistics, choose_cameras, sample_rays
+from viewmend.models.views.sampler import CameraChoice, Rays, RaySamples, RayStatistics, sample_rays
 from viewmend.models.views.steadying import steady
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
@@ -71,9 +71,8 @@ Mask = Bool[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
-CHOOSING_OFFSETS = (0.0, 0.053, 0.19)
-"""The cameras of a ray are chosen by how well they see it at these z-depths behind the proxy, in subject
-sizes (`SceneScale.size_m`)."""
+CHOOSING_SAMPLES = tuple(OFFSETS.index(offset) for offset in (0.0, 0.053, 0.19))
+"""The cameras of a ray are chosen by how well they see these of its samples."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """The U-Net gets this many channels of a cell, apart from its ray samples: those of `ViewImage`, the depth
 of the proxy relative to the subject's median depth, and whether the proxy or its rim covers the cell."""
@@ -347,14 +346,11 @@ class ViewSynthNet(Network):
 
         `view` has depth on the rim, too; `cell_depth` is its `depth_of_cells`.
         """
-        # The cameras and depth hypotheses of the cells' rays
+        # The depth hypotheses of the cells' rays
         proxy_depth, whole_depth = cell_depth
         rows, columns = cells.unbind(1)
-        proxy_z = proxy_depth[rows, columns]
-        choosing_z = scale.depths_behind(proxy_z, CHOOSING_OFFSETS)
-        choosing_rays = Rays(view, scale, cells, choosing_z, cell_px=CELL_PX)
-        cameras = choose_cameras(choosing_rays, sources, RAY_VIEWS)
-        rays = replace(choosing_rays, z_m=scale.depths_behind(proxy_z, OFFSETS), cameras=cameras)
+        z_m = scale.depths_behind(proxy_depth[rows, columns], OFFSETS)
+        rays = Rays(view, scale, cells, z_m, cell_px=CELL_PX)
 
         # Further inputs of the U-Net, in all cells: the rendered view, and all depth of the proxy and its rim
         has_depth = whole_depth > 0
@@ -364,7 +360,7 @@ class ViewSynthNet(Network):
 
         # Score of each hypothesis: that of its sample alone, plus that of its neighbourhood
         with self.autocast():
-            samples = self._aggregate(rays, sources)
+            samples, cameras = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             stop_if_cancelled()
             with all_threads():
@@ -373,14 +369,20 @@ class ViewSynthNet(Network):
         cell_index = index_image(cells, proxy_depth.shape)
         return DepthDistribution(cells, cell_index, proxy_depth, logits, samples, cameras, features)
 
-    def _aggregate(self, rays: Rays, sources: SourceCameras) -> AggregatedSamples:
-        """The aggregated samples of the rays of cells, computed in chunks."""
+    def _aggregate(
+        self, rays: Rays, sources: SourceCameras
+    ) -> tuple[AggregatedSamples, Int[Tensor, "cell view"] | None]:
+        """The aggregated samples of the rays of cells, and the cameras chosen for each; computed in chunks."""
         parts = []
+        cameras = []
         for chunk in rays.split(sources.rays_at_once):
             stop_if_cancelled()
-            samples = sample_rays(chunk, sources, step_px=float(CELL_PX))
+            choice = CameraChoice(CHOOSING_SAMPLES, RAY_VIEWS)
+            samples = sample_rays(chunk, sources, step_px=float(CELL_PX), choice=choice)
             parts.append(self.sample_aggregator(samples))
-        return AggregatedSamples.cat(parts)
+            cameras.append(samples.cameras)
+        chosen = cameras[0] if len(cameras) == 1 or cameras[0] is None else torch.cat(cameras)
+        return AggregatedSamples.cat(parts), chosen
 
     def _blend(
         self,

@@ -41,7 +41,7 @@ from viewmend.models.views.sampler import (
 )
 from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
-from viewmend.utils.tensors import nonzero_of
+from viewmend.utils.tensors import counts_of
 
 Image = Float[Tensor, "3 height width"]
 Features = Float[Tensor, "pixel point view 14"]
@@ -167,14 +167,14 @@ class RayFill(Network, Fill):
         missing = view.error > 0
         wide = wide_holes(missing)
         has_depth = view.depth > 0
-        pixels, of_wide, without_depth = nonzero_of(missing & has_depth.any(), wide, missing & ~has_depth)
-        if len(of_wide):
+        to_fill = missing & has_depth.any()
+        count, num_wide, num_without_depth = counts_of(to_fill, wide, missing & ~has_depth)
+        pixels = torch.nonzero_static(to_fill, size=count)
+        if num_wide:
             smooth = fill_wide(view.rgb, missing, view.mask > 0, wide)
         else:
             smooth = fill_thin(view.rgb, missing)
-        inputs = gather_ray_inputs(
-            view, sources, pixels, smooth, scale, all_have_depth=not len(without_depth)
-        )
+        inputs = gather_ray_inputs(view, sources, pixels, smooth, scale, all_have_depth=not num_without_depth)
         colours = self.mix(inputs)
         return smooth.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 

@@ -120,6 +120,16 @@ class RaySamples(NamedTuple):
     the proxy. The sum is 1, or 0 where no camera has the sample in view. `sample_fill_rays` sets 0."""
     statistics: Float[Tensor, "ray sample 10"]
     """`RayStatistics`, stacked; `sample_fill_rays` computes only the masks."""
+    cameras: Int[Tensor, "ray view"] | None = None
+    """Indices of the source cameras, as `Rays.cameras`."""
+
+
+class CameraChoice(NamedTuple):
+    """How the source cameras of a ray are chosen: the `count` cameras that see some of its samples best."""
+
+    samples: tuple[int, ...]
+    """Indices of these samples."""
+    count: int
 
 
 class CameraFeatures(NamedTuple):
@@ -202,42 +212,62 @@ class _Boxes(NamedTuple):
         return found
 
 
-def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
+def sample_rays(
+    rays: Rays,
+    sources: SourceCameras,
+    step_px: float,
+    cubic: bool = False,
+    choice: CameraChoice | None = None,
+) -> RaySamples:
     """Samples the source cameras, at the pyramid levels that match rays with a spacing of `step_px`.
 
     With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than
-    bilinear ones.
+    bilinear ones. With `choice`, a ray is sampled in the cameras that are chosen for it.
     """
     if torch.compiler.is_exporting():
-        return sample_rays_torch(rays, sources, step_px, cubic)
+        return sample_rays_torch(with_cameras(rays, sources, choice), sources, step_px, cubic)
     with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
         if not sources.use_kernels:
-            return sample_rays_torch(rays, sources, step_px, cubic)
+            return sample_rays_torch(rays, sources, step_px, cubic, choice)
+        rays = with_cameras(rays, sources, choice)
         image_levels, silhouette_levels = sources.levels(rays.view.camera, step_px, rays.scale)
         images = _at_levels(sources.pyramids, image_levels)
         silhouettes = _at_levels(sources.silhouette_pyramids, silhouette_levels)
         return _sample_numba(rays, sources, images, silhouettes, min_coverage=0.0, cubic=cubic)
 
 
-def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
-    """The reference of `sample_rays`."""
-    levels, silhouettes = sources.mips(rays.view.camera, step_px, rays.scale)
-
+def sample_rays_torch(
+    rays: Rays,
+    sources: SourceCameras,
+    step_px: float,
+    cubic: bool = False,
+    choice: CameraChoice | None = None,
+) -> RaySamples:
+    """The reference of `sample_rays`. It chooses cameras by samples that it takes anyway."""
     # The cameras chosen for each ray. In an exported model, an index that stands for no camera becomes
     # that of the last one, which then has no sample in view.
     chosen = None
     last = sources.cameras.K.shape[0] - 1
     if rays.cameras is not None:
         chosen = rays.cameras.clamp_max(last) if torch.compiler.is_exporting() else rays.cameras
-        levels = levels.of_cameras(chosen)
 
     # Positions in the cameras, and distances behind the proxy there
     projected, cosines, in_silhouettes = _project_into_all(rays, sources, chosen)
     if rays.cameras is not None and torch.compiler.is_exporting():
         projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
     behind = _distance_behind(sources, projected, chosen)
+    if choice is not None and choice.count <= last:
+        weights = _weights(rays, projected, cosines, behind)
+        chosen = _highest(weights[:, list(choice.samples)].sum(1).float(), choice.count)
+        seen = torch.stack([*projected.uv_px.unbind(-1), projected.z_m, behind, cosines], -1)
+        kept = seen.gather(2, chosen[:, None, :, None].expand(-1, seen.shape[1], -1, seen.shape[3]))
+        projected = Projections(kept[..., :2], kept[..., 2], kept[..., 2] > 0)
+        behind = kept[..., 3]
+        cosines = kept[..., 4]
 
     # What each camera shows
+    levels, silhouettes = sources.mips(rays.view.camera, step_px, rays.scale)
+    levels = levels if chosen is None else levels.of_cameras(chosen)
     if cubic:
         fine = sample_level_cubic(levels.at(0), projected, RGB_MASK)
         wide = sample_level(levels.at(1), projected, RGB_MASK_COVERAGE)
@@ -257,7 +287,8 @@ def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic:
     # The silhouettes of the whole rig
     smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
     statistics = torch.cat([mean.squeeze(2), variance.squeeze(2), *smallest], -1)
-    return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics)
+    cameras = chosen if rays.cameras is None else rays.cameras
+    return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics, cameras)
 
 
 def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
@@ -409,6 +440,14 @@ def _look_up(table: Shaped[Tensor, "row *channel"], index: Int[Tensor, "*sample"
     return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
 
 
+def with_cameras(rays: Rays, sources: SourceCameras, choice: CameraChoice | None) -> Rays:
+    """The rays with the cameras that are chosen for them; the same rays without a choice."""
+    if choice is None:
+        return rays
+    some_samples = replace(rays, z_m=rays.z_m[:, list(choice.samples)])
+    return replace(rays, cameras=choose_cameras(some_samples, sources, choice.count))
+
+
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
     """Indices of the `count` source cameras with the highest prior weights on each ray; None if that is all of them.
 
@@ -424,6 +463,11 @@ def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor
     if len(sources.cameras) <= count:
         return None
     scores = _score_numba(rays, sources) if sources.use_kernels else score_cameras_torch(rays, sources)
+    return _highest(scores, count)
+
+
+def _highest(scores: Float[Tensor, "ray camera"], count: int) -> Int[Tensor, "ray view"]:
+    """Indices of the highest scores."""
     return _without_ties(scores).topk(count, 1).indices
 
 
@@ -436,8 +480,19 @@ def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ra
     """The reference of the scores of `choose_cameras`."""
     lines = CameraLines.of(rays, sources.cameras)
     projected = lines.project()
-    near = F.softsign(_distance_behind(sources, projected) / (NEAR * rays.scale.size_m))
-    return (projected.in_view * _closeness(lines.viewing_cosines(), near)).sum(1).float()
+    behind = _distance_behind(sources, projected)
+    return _weights(rays, projected, lines.viewing_cosines(), behind).sum(1).float()
+
+
+def _weights(
+    rays: Rays,
+    projected: Projections,
+    cosines: Float[Tensor, "ray sample view"],
+    behind: Float[Tensor, "ray sample view"],
+) -> Float[Tensor, "ray sample view"]:
+    """Prior weights of the cameras, not normalised, by distances behind the proxy, metres."""
+    near = F.softsign(behind / (NEAR * rays.scale.size_m))
+    return projected.in_view * _closeness(cosines, near)
 
 
 class CameraLines(NamedTuple):
@@ -591,7 +646,8 @@ def sample_level_cubic(
     tap = torch.arange(-1, 3, device=share.device)
     place = (whole[..., None] + tap).clamp_min(0)
     column, row = torch.minimum(place, levels.last[..., None]).unbind(-2)
-    index = (levels.first[..., :1] + row * levels.columns[..., None])[..., None] + column[..., None, :]
+    first = torch.addcmul(levels.first[..., :1], row, levels.columns[..., None])
+    index = first[..., None] + column[..., None, :]
     squared = share * share
     powers = torch.stack([torch.ones_like(share), share, squared, squared * share], -1)
     across, down = (powers @ share.new_tensor(CATMULL_ROM)).unbind(-2)
@@ -689,7 +745,8 @@ def _sample_numba(
             kernels.compare_silhouette(first, end, z, per_metre, start, size, masks, scales, smallest_masks)
 
     parallel_for(work, -(-count // band_rays))
-    return RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
+    arrays = (torch.from_numpy(array) for array in (features, prior, statistics))
+    return RaySamples(*arrays, rays.cameras)
 
 
 def _score_numba(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
