@@ -22,10 +22,10 @@ SIZE_PX = 96
 FIRST = orbit([0.4], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 NEXT = orbit([0.5], (SIZE_PX, SIZE_PX), elevation_rad=0.25)
 CEILINGS = {
-    "telea": (280, 6, 7),
-    "rays": (565, 7, 17),
-    "views": (1160, 9, 43),
-    "paper-small": (598, 6, 17),
+    "telea": (222, 6, 7),
+    "rays": (450, 7, 17),
+    "views": (900, 8, 37),
+    "paper-small": (540, 6, 17),
 }
 """Kernels, waits and copies of a second view of a frame, close to the first."""
 MIN_PSNR_DB = 100.0

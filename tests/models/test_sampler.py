@@ -23,6 +23,7 @@ from viewmend.models.views.ray_fill import sample_behind_proxy
 from viewmend.models.views.sampler import (
     CAMERA_CHANNELS,
     PATCH,
+    CameraChoice,
     CameraFeatures,
     Projections,
     Rays,
@@ -32,6 +33,7 @@ from viewmend.models.views.sampler import (
     sample_level_cubic,
     sample_rays,
     sample_rays_torch,
+    with_cameras,
 )
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.types import Silhouettes
@@ -87,8 +89,8 @@ def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
     fast, slow = sample_rays(*given, cubic=cubic), sample_rays_torch(*given, cubic=cubic)
     levels = sources.levels(view.camera, step_px, SceneScale.of(view))
     assert min(level for part in levels for pair in part for level in pair) == {1.0: 0, 5.0: 2}[step_px]
-    for name, one, other in zip(fast._fields, fast, slow, strict=True):
-        off = (one - other).abs()
+    for name in ("features", "prior", "statistics"):
+        off = (getattr(fast, name) - getattr(slow, name)).abs()
         flips = (off > 1e-3).float().mean()  # of the proxy's nearest pixel, where a position is between two
         assert float(flips) < 2e-3 and float(off.median()) < 1e-6, name
     assert float(fast.prior.sum(2).max()) <= 1 + 1e-5 and float(fast.statistics[..., 3:6].max()) > 0.1
@@ -112,7 +114,7 @@ def test_positions_stay_exact_under_autocast(scene):
     given = rays_of(view), sources, 2.0
     with torch.autocast("cpu", torch.bfloat16):
         again = sample_rays(*given)
-    assert all(torch.equal(one, other) for one, other in zip(sample_rays(*given), again, strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(sample_rays(*given)[:3], again[:3], strict=True))
 
 
 def test_levels_are_means_with_a_black_border():
@@ -193,10 +195,10 @@ def samples():
 def test_the_compiled_loop_equals_pytorch(samples, own_prior):
     torch.manual_seed(0)
     net, prior = SampleAggregator(24, 12), None if own_prior else torch.rand(150, 3, 5)
-    before = [part.clone() for part in samples]
+    before = [part.clone() for part in samples[:3]]
     with torch.no_grad():
         fast = net(samples, prior)
-    assert all(torch.equal(part, old) for part, old in zip(samples, before, strict=True)), (
+    assert all(torch.equal(part, old) for part, old in zip(samples[:3], before, strict=True)), (
         "inputs are not changed"
     )
     slow = net(samples, prior)
@@ -208,7 +210,7 @@ def test_the_compiled_loop_equals_pytorch(samples, own_prior):
     assert not bool(fast.trust[seen == 0].any())
     torch.testing.assert_close(fast.trust.sum(2), seen.amax(2), atol=1e-5, rtol=0)
     mean = (fast.trust[..., None] * samples.features).sum(2)
-    torch.testing.assert_close(torch.cat([fast.colour, fast.mask], -1), mean[..., :4])
+    torch.testing.assert_close(fast.rgba, mean[..., :4])
 
 
 def some_cameras(rays, cameras: int, count: int):
@@ -263,6 +265,17 @@ def test_cameras_are_chosen_by_their_prior_weights(scene, kernels, monkeypatch):
     torch.testing.assert_close(own, others, atol=1e-2, rtol=1e-3)
     assert len(chosen.unique(dim=0)) > 3, "they depend on the ray"
     assert choose_cameras(rays, sources, len(sources.cameras)) is None
+
+
+def test_cameras_chosen_by_samples_that_are_taken_anyway_are_the_same(scene, monkeypatch):
+    _, view, sources = scene
+    monkeypatch.setattr(SourceCameras, "use_kernels", False)
+    rays, choice = rays_of(view), CameraChoice((1, 6, 10), 2)
+    found = sample_rays_torch(rays, sources, 2.0, choice=choice)
+    wanted = sample_rays_torch(with_cameras(rays, sources, choice), sources, 2.0)
+    assert torch.equal(found.cameras, wanted.cameras) and len(found.cameras.unique(dim=0)) > 3
+    for one, other in zip(found[:3], wanted[:3], strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("way", ["kernels", "torch", "export"])

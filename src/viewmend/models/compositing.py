@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -39,7 +39,13 @@ def camera_image(frame: MultiViewFrame, background: Background) -> Image:
     return composite(background, frame.rgb[0].float() / 255 * alpha, alpha)
 
 
-def blend(known: Image, error: Plane, inpainted: Image, coverage: Plane, clamp: bool = True) -> Image:
+def blend(
+    known: Image,
+    error: Plane,
+    inpainted: Image,
+    coverage: Shaped[Tensor, "height width"],
+    clamp: bool = True,
+) -> Image:
     """Fhat = E Ftilde + (1 - E) F (section 1). Bit-identical to F where E or the coverage of Ftilde is 0.
 
     With `clamp`, Ftilde is clamped to [0, 1] first.

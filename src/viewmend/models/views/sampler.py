@@ -125,11 +125,11 @@ class RaySamples(NamedTuple):
 
 
 class CameraChoice(NamedTuple):
-    """How the source cameras of a ray are chosen: the `count` cameras that see some of its samples best."""
+    """How the source cameras of a ray are chosen: the `views` cameras that see some of its samples best."""
 
     samples: tuple[int, ...]
     """Indices of these samples."""
-    count: int
+    views: int
 
 
 class CameraFeatures(NamedTuple):
@@ -256,9 +256,9 @@ def sample_rays_torch(
     if rays.cameras is not None and torch.compiler.is_exporting():
         projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
     behind = _distance_behind(sources, projected, chosen)
-    if choice is not None and choice.count <= last:
+    if choice is not None and choice.views <= last:
         weights = _weights(rays, projected, cosines, behind)
-        chosen = _highest(weights[:, list(choice.samples)].sum(1).float(), choice.count)
+        chosen = _highest(weights[:, list(choice.samples)].sum(1).float(), choice.views)
         seen = torch.stack([*projected.uv_px.unbind(-1), projected.z_m, behind, cosines], -1)
         kept = seen.gather(2, chosen[:, None, :, None].expand(-1, seen.shape[1], -1, seen.shape[3]))
         projected = Projections(kept[..., :2], kept[..., 2], kept[..., 2] > 0)
@@ -445,7 +445,7 @@ def with_cameras(rays: Rays, sources: SourceCameras, choice: CameraChoice | None
     if choice is None:
         return rays
     some_samples = replace(rays, z_m=rays.z_m[:, list(choice.samples)])
-    return replace(rays, cameras=choose_cameras(some_samples, sources, choice.count))
+    return replace(rays, cameras=choose_cameras(some_samples, sources, choice.views))
 
 
 def choose_cameras(rays: Rays, sources: SourceCameras, count: int) -> Int[Tensor, "ray view"] | None:
@@ -678,7 +678,7 @@ def _box_sides(
 
 def _smallest_rig_masks(
     sources: SourceCameras, projected: Projections, side: Int[Tensor, ""]
-) -> Sequence[Float[Tensor, "ray sample 2"]]:
+) -> tuple[Float[Tensor, "ray sample 2"], ...]:
     """The smallest masks of all cameras of the rig, single and averaged over boxes of this side."""
     masks = sources.silhouettes.mask[:, None].float()
     silhouettes = _sample_with_means(masks, [(1, side)], projected)
@@ -687,7 +687,7 @@ def _smallest_rig_masks(
 
 def _smallest_masks(
     projected: Projections, masks: Float[Tensor, "kind=2 ray sample view"]
-) -> Sequence[Float[Tensor, "ray sample 2"]]:
+) -> tuple[Float[Tensor, "ray sample 2"], ...]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
     seen = masks.masked_fill(~projected.in_view, 1.0)
     at_least_two = F.pad(seen, (0, 1), value=1.0)
@@ -745,8 +745,8 @@ def _sample_numba(
             kernels.compare_silhouette(first, end, z, per_metre, start, size, masks, scales, smallest_masks)
 
     parallel_for(work, -(-count // band_rays))
-    arrays = (torch.from_numpy(array) for array in (features, prior, statistics))
-    return RaySamples(*arrays, rays.cameras)
+    found = RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
+    return found._replace(cameras=rays.cameras)
 
 
 def _score_numba(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
