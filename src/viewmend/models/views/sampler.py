@@ -532,8 +532,9 @@ class CameraLines(NamedTuple):
         """The position of every sample."""
         z = self.rays.z_m[:, :, None, None]
         start, end, _ = self.constants.unsqueeze(-3).split((3, 3, 1), -1)
-        uvw = torch.addcmul(start, self.step[:, None, :, :3], z)
-        uvw[..., :2].div_(uvw[..., 2:].clamp_min(1e-6))
+        homogeneous = torch.addcmul(start, self.step[:, None, :, :3], z)
+        w = homogeneous[..., 2:]
+        uvw = torch.cat([homogeneous[..., :2] / w.clamp_min(1e-6), w], -1)
         in_view = ((uvw >= 0) & (uvw < end)).all(-1) & (z > 0)[..., 0]
         visible = uvw * in_view[..., None]
         return Projections(uv_px=visible[..., :2], z_m=visible[..., 2], in_view=in_view)
@@ -690,8 +691,9 @@ def _smallest_masks(
 ) -> tuple[Float[Tensor, "ray sample 2"], ...]:
     """The two smallest masks and the two smallest averaged masks where samples are in view; 1 if there are none."""
     seen = masks.masked_fill(~projected.in_view, 1.0)
-    at_least_two = F.pad(seen, (0, 1), value=1.0)
-    return at_least_two.topk(2, largest=False).values.unbind(0)
+    if torch.compiler.is_exporting() or seen.shape[-1] < 2:  # an exported model takes any number of cameras
+        seen = F.pad(seen, (0, 1), value=1.0)
+    return seen.topk(2, largest=False).values.unbind(0)
 
 
 def _sample_numba(
