@@ -149,7 +149,7 @@ class Cameras(OnDevice):
 
     @cached_property
     def world_from_pixel(self) -> Float[Tensor, "view 3 3"]:
-        """From homogeneous pixel coordinates to rays of z = 1 in the camera's axes, in world axes."""
+        """R K^-1: turns homogeneous pixel coordinates into rays of z = 1 in the camera's axes, in world axes."""
         if self.K.device.type != "cpu":
             return self.on_host.world_from_pixel.to(self.K.device)
         with torch.inference_mode(False):

@@ -557,7 +557,7 @@ class CameraLines(NamedTuple):
 def _projection_from(
     origin: Float[Tensor, "3"], cameras: Cameras
 ) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 3"]]:
-    """From a step in world coordinates to one in homogeneous image coordinates, and the origin in these; on the CPU."""
+    """Turns a step in world coordinates into one in homogeneous image coordinates; and the origin there; on the CPU."""
     P = _on_host(cameras).projection
     linear = P[:, :, :3]
     return linear, linear @ origin + P[:, :, 3]
@@ -747,8 +747,9 @@ def _sample_numba(
             kernels.compare_silhouette(first, end, z, per_metre, start, size, masks, scales, smallest_masks)
 
     parallel_for(work, -(-count // band_rays))
-    found = RaySamples(torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics))
-    return found._replace(cameras=rays.cameras)
+    return RaySamples(
+        torch.from_numpy(features), torch.from_numpy(prior), torch.from_numpy(statistics), rays.cameras
+    )
 
 
 def _score_numba(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ray camera"]:
