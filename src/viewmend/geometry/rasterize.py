@@ -169,24 +169,54 @@ def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     # Every triangle of every view has a box of pixels. Only the total number of pixels is read from the device
     area = extent.prod(-1).flatten()
     ends = area.cumsum(0)
-    device = ends.device
-    faces = torch.arange(FIRST_FACE, FIRST_FACE - len(mesh.faces), -1, device=device).expand(views, -1)
-    first_pixel = torch.arange(0, views * height * width, height * width, device=device)
-    columns = [(ends - area).view_as(faces), extent[..., 0], faces, first_pixel[:, None].expand_as(faces)]
-    boxes = torch.cat([torch.stack(columns, -1), low], -1).flatten(0, 1)
+    boxes = _box_table(low, extent, ends - area, width * height)
 
-    # A key holds the face and 1/z; the largest orders by 1/z, then by the lower face: positive floats order
-    # like their bits
-    keys = torch.full((views * height * width,), EMPTY, dtype=torch.long, device=device)
+    keys = torch.full((views * height * width,), EMPTY, dtype=torch.long, device=ends.device)
     for part, begin, pixels in _portions(ends):
         box = torch.repeat_interleave(area[part], output_size=pixels)
-        face, pixel, uv = _candidate_pixels(boxes[part][box], begin, width)
-        inverse = _inverse_depth(planes.flatten(0, 1)[part][box], uv)
-        key = torch.stack([face.int(), inverse.view(torch.int32)], -1).view(torch.long)[:, 0]
-        keys.scatter_reduce_(0, pixel, key, "amax")
+        _draw(keys, boxes[part][box], planes.flatten(0, 1)[part][box], begin, width)
 
     depth, triangle = _unpack_keys(keys.view(views, height, width))
     return Raster(depth, triangle, planes)
+
+
+def _box_table(
+    low: Int[Tensor, "view face 2"],
+    extent: Int[Tensor, "view face 2"],
+    first: Int[Tensor, "box"],
+    image_px: int,
+) -> Int[Tensor, "box 6"]:
+    """The boxes of all triangles, view by view, as `_candidate_pixels` reads them.
+
+    Args:
+        low: first column and row of each box.
+        extent: numbers of its columns and rows.
+        first: its first candidate.
+        image_px: pixels of an image.
+    """
+    views, faces = extent.shape[:2]
+    half_key = torch.arange(FIRST_FACE, FIRST_FACE - faces, -1, device=low.device).expand(views, -1)
+    of_view = torch.arange(0, views * image_px, image_px, device=low.device)[:, None].expand(-1, faces)
+    columns = [first.view(views, faces), extent[..., 0], half_key, of_view]
+    return torch.cat([torch.stack(columns, -1), low], -1).flatten(0, 1)
+
+
+def _draw(
+    keys: Int[Tensor, "pixel"],
+    boxes: Int[Tensor, "candidate 6"],
+    planes: Float[Tensor, "candidate 3 3"],
+    begin: int,
+    width: int,
+) -> None:
+    """Write the keys of candidates, of which `begin` is the first, into images of this width, unless others are larger.
+
+    A key holds 1/z and the face; it orders by 1/z, then by the lower face, since positive floats order like
+    their bits.
+    """
+    face, pixel, uv = _candidate_pixels(boxes, begin, width)
+    inverse = _inverse_depth(planes, uv)
+    key = torch.stack([face.int(), inverse.view(torch.int32)], -1).view(torch.long)[:, 0]
+    keys.scatter_reduce_(0, pixel, key, "amax")
 
 
 def _unpack_keys(

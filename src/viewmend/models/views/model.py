@@ -88,6 +88,8 @@ PIXEL_CHANNELS = 27
 of the pixel's sample."""
 OUTPUT_CHANNELS = (NUM_CANDIDATES, 1, 1, NUM_GAINS)
 """The last convolutions return scores of the candidate colours, alpha, confidence, and gains of detail."""
+DETAILED = slice(1, NUM_CANDIDATES, 2)
+"""The candidate colours `single` and `rendered`, whose detail is added to the blended colours, too."""
 ALPHA_SLOPE = 4.0
 """The cameras' mean mask, minus 0.5, is multiplied by this factor and added to the logit of alpha."""
 MIN_DETAIL_WEIGHT = 0.01
@@ -408,7 +410,6 @@ class ViewSynthNet(Network):
 
         # The last convolutions score the candidate colours, and predict alpha, confidence and gains
         candidates = candidate_colours(samples.features[:, 0], aggregated, means, image, pixels)
-        colours = CandidateColours.unstack(candidates)
         statistics = RayStatistics.unstack(samples.statistics[:, 0])
         inputs = pixel_inputs(candidates, mask, means.rgba[:, 3:], statistics, surface, image, pixels)
         inputs = torch.cat([inputs, aggregated.features[:, 0]], 1)
@@ -417,7 +418,7 @@ class ViewSynthNet(Network):
 
         # Blend the colours, then add detail
         blended = (scores.softmax(1)[:, None] @ candidates)[:, 0]
-        detail_sources = torch.stack([blended, colours.single, colours.rendered], 1)
+        detail_sources = torch.cat([blended[:, None], candidates[:, DETAILED]], 1)
         magnification = sources.magnification(view.camera, scale)
         detail = amplify_detail(detail_sources, mask, gains, pixels, view.mask.shape, magnification)
 

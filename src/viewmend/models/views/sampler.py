@@ -187,6 +187,39 @@ class Projections(NamedTuple):
     in_view: Bool[Tensor, "ray sample view"]
 
 
+class _InImages(NamedTuple):
+    """Where the samples of rays lie in the source cameras."""
+
+    projected: Projections
+    cosines: Float[Tensor, "ray sample view"]
+    """Cosine of the angle at the sample between viewer and camera."""
+    behind: Float[Tensor, "ray sample view"]
+    """Distance behind the proxy, as the camera sees it."""
+
+    def of_cameras(self, chosen: Int[Tensor, "ray view"]) -> "_InImages":
+        """The same in the cameras chosen for each ray; gathered together."""
+        uv_px, z_m = self.projected[:2]
+        all_values = torch.stack([*uv_px.unbind(-1), z_m, self.behind, self.cosines], -1)
+        index = chosen[:, None, :, None].expand(-1, all_values.shape[1], -1, all_values.shape[3])
+        values = all_values.gather(2, index)
+        z_of_chosen = values[..., 2]
+        projected = Projections(values[..., :2], z_of_chosen, z_of_chosen > 0)
+        return _InImages(projected, values[..., 4], values[..., 3])
+
+
+class _Comparison(NamedTuple):
+    """How the cameras agree in a sample."""
+
+    prior: Float[Tensor, "ray sample view 1"]
+    """Weight of each camera before it is learned."""
+    mean: Float[Tensor, "ray sample 1 3"]
+    """Mean colour by these weights."""
+    difference: Float[Tensor, "ray sample view 3"]
+    """Each camera's colour minus the mean; 0 where the sample is not in view."""
+    variance: Float[Tensor, "ray sample 1 3"]
+    """Variance of the colour by these weights, times `CONTRAST`."""
+
+
 class _Boxes(NamedTuple):
     """Boxes over which some channels of an image with a border are averaged; see `_sampler_numba.average_boxes`."""
 
@@ -256,39 +289,43 @@ def sample_rays_torch(
     if rays.cameras is not None and torch.compiler.is_exporting():
         projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
     behind = _distance_behind(sources, projected, chosen)
+    in_images = _InImages(projected, cosines, behind)
     if choice is not None and choice.views <= last:
         weights = _weights(rays, projected, cosines, behind)
         chosen = _highest(weights[:, list(choice.samples)].sum(1).float(), choice.views)
-        seen = torch.stack([*projected.uv_px.unbind(-1), projected.z_m, behind, cosines], -1)
-        kept = seen.gather(2, chosen[:, None, :, None].expand(-1, seen.shape[1], -1, seen.shape[3]))
-        projected = Projections(kept[..., :2], kept[..., 2], kept[..., 2] > 0)
-        behind = kept[..., 3]
-        cosines = kept[..., 4]
+        in_images = in_images.of_cameras(chosen)
 
     # What each camera shows
     levels, silhouettes = sources.mips(rays.view.camera, step_px, rays.scale)
     levels = levels if chosen is None else levels.of_cameras(chosen)
     if cubic:
-        fine = sample_level_cubic(levels.at(0), projected, RGB_MASK)
-        wide = sample_level(levels.at(1), projected, RGB_MASK_COVERAGE)
+        fine = sample_level_cubic(levels.at(0), in_images.projected, RGB_MASK)
+        wide = sample_level(levels.at(1), in_images.projected, RGB_MASK_COVERAGE)
     else:
-        fine_with_coverage, wide = sample_level(levels, projected, RGB_MASK_COVERAGE)
+        fine_with_coverage, wide = sample_level(levels, in_images.projected, RGB_MASK_COVERAGE)
         fine = fine_with_coverage[..., :RGB_MASK]
-    stacked = _camera_features(rays, sources, projected, cosines, fine, wide, behind, F.softsign, chosen)
-    features = CameraFeatures.unstack(stacked)
+    features = _camera_features(
+        rays, sources, *in_images[:2], fine, wide, in_images.behind, F.softsign, chosen
+    )
 
-    # Prior weights, and how the cameras differ by them
-    prior = features.in_view * _closeness(features.viewing_cosine, features.depth_difference)
-    prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
+    # How the cameras differ, and the silhouettes of the whole rig
+    comparison = _compare(CameraFeatures.unstack(features))
+    smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
+    statistics = torch.cat([comparison.mean.squeeze(2), comparison.variance.squeeze(2), *smallest], -1)
+    cameras = chosen if rays.cameras is None else rays.cameras
+    prior = comparison.prior
+    return RaySamples(
+        torch.cat([features, comparison.difference, prior], -1), prior[..., 0], statistics, cameras
+    )
+
+
+def _compare(features: CameraFeatures) -> _Comparison:
+    """Prior weights of the cameras, and how their colours differ by them."""
+    weights = features.in_view * _closeness(features.viewing_cosine, features.depth_difference)
+    prior = weights / (weights.sum(2, keepdim=True) + 1e-6)
     mean = prior.mT @ features.colour
     difference = features.in_view * (features.colour - mean)
-    variance = CONTRAST * (prior.mT @ difference.square())
-
-    # The silhouettes of the whole rig
-    smallest = _smallest_masks(in_silhouettes, sample_level(silhouettes, in_silhouettes, 1)[..., 0])
-    statistics = torch.cat([mean.squeeze(2), variance.squeeze(2), *smallest], -1)
-    cameras = chosen if rays.cameras is None else rays.cameras
-    return RaySamples(torch.cat([stacked, difference, prior], -1), prior[..., 0], statistics, cameras)
+    return _Comparison(prior, mean, difference, CONTRAST * (prior.mT @ difference.square()))
 
 
 def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
