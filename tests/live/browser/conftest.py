@@ -101,12 +101,18 @@ class View:
 
 # Tests ask for small pictures at rest too, unless that is what they test: the stand-in traces each ray.
 @contextlib.contextmanager
-def opened(browser, server, size="desktop", query="?sharp=0", route=None, **options) -> Iterator[View]:
-    """A page of a server or the stand-in, without errors; `route` answers its requests for assets, which may fail."""
+def opened(
+    browser, server, size="desktop", query="?sharp=0", route=None, script="", **options
+) -> Iterator[View]:
+    """A page of a server or the stand-in, without errors.
+
+    `route` answers its requests for assets, which may fail; `script` is JavaScript that runs before the page's own.
+    """
     width, height = SIZES[size]
     touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
     context = browser.new_context(viewport={"width": width, "height": height}, **touch, **options)
     context.set_default_timeout(1000 * SCREENSHOT_S)
+    context.add_init_script(script)
     page = context.new_page()
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))

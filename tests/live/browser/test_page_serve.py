@@ -12,6 +12,19 @@ import pytest
 from live.browser.conftest import SIZES, View, opened
 
 pytestmark = pytest.mark.slow
+KEEP_LOOKS = (
+    "(() => { const post = Worker.prototype.postMessage;"
+    " Worker.prototype.postMessage = function (command, ...rest) {"
+    "   const message = command.send ? JSON.parse(command.send) : {};"
+    "   if (message.type === 'look') window.lastLook = message;"
+    "   return post.call(this, command, ...rest); }; })()"
+)
+"""JavaScript that keeps the last look that the page sends to the server."""
+ANSWERED = (
+    "(() => { const look = window.lastLook, shown = document.querySelector('#picture').dataset;"
+    " return look && !look.moving && shown.look === String(look.id) && shown.full === 'true'; })()"
+)
+"""JavaScript: whether the picture is the full answer to that look, at rest."""
 SCENE = ("studio", "--size", "128", "--frames", "5", "--cameras", "6", "--port", "0", "--budget-ms", "0")
 
 
@@ -35,7 +48,8 @@ def served() -> Iterator[SimpleNamespace]:
 @pytest.fixture(params=list(SIZES))
 def view(browser, served, request) -> Iterator[View]:
     # The server's pictures are what these tests are about.
-    with opened(browser, served, request.param, "?side=256&sharp=0&render=server") as view:
+    query = "?side=256&sharp=0&render=server"
+    with opened(browser, served, request.param, query, script=KEEP_LOOKS) as view:
         view.page.wait_for_selector("#picture[data-frame]", timeout=120_000)
         view.page.locator("#play").click()
         rest(view)
@@ -43,12 +57,11 @@ def view(browser, served, request) -> Iterator[View]:
 
 
 def rest(view: View) -> None:
-    """Until a picture at full quality has stayed for a while."""
-    view.page.wait_for_timeout(400)
-    view.until(lambda: view.data("full") == "true")
-    last = None
-    while last != (last := view.data("frame")):
-        view.page.wait_for_timeout(500)
+    """Wait until the picture is the full answer to the page's last look, and the view rests."""
+    view.page.wait_for_timeout(60)
+    view.until(ANSWERED)
+    view.page.wait_for_timeout(200)
+    view.until(ANSWERED)
 
 
 def test_pictures_answer_to_pose_mode_and_time(view):
