@@ -194,12 +194,12 @@ class _InImages(NamedTuple):
     cosines: Float[Tensor, "ray sample view"]
     """Cosine of the angle at the sample between viewer and camera."""
     behind: Float[Tensor, "ray sample view"]
-    """Distance behind the proxy, as the camera sees it."""
+    """Distance behind the proxy in the camera's view, metres."""
 
     def of_cameras(self, chosen: Int[Tensor, "ray view"]) -> "_InImages":
         """The same in the cameras chosen for each ray; gathered together."""
-        uv_px, z_m = self.projected[:2]
-        all_values = torch.stack([*uv_px.unbind(-1), z_m, self.behind, self.cosines], -1)
+        columns, rows = self.projected.uv_px.unbind(-1)
+        all_values = torch.stack([columns, rows, self.projected.z_m, self.behind, self.cosines], -1)
         index = chosen[:, None, :, None].expand(-1, all_values.shape[1], -1, all_values.shape[3])
         values = all_values.gather(2, index)
         z_of_chosen = values[..., 2]
@@ -285,13 +285,12 @@ def sample_rays_torch(
         chosen = rays.cameras.clamp_max(last) if torch.compiler.is_exporting() else rays.cameras
 
     # Positions in the cameras, and distances behind the proxy there
-    projected, cosines, in_silhouettes = _project_into_all(rays, sources, chosen)
+    into_all, cosines, in_silhouettes = _project_into_all(rays, sources, chosen)
     if rays.cameras is not None and torch.compiler.is_exporting():
-        projected = projected._replace(in_view=projected.in_view & (rays.cameras <= last)[:, None])
-    behind = _distance_behind(sources, projected, chosen)
-    in_images = _InImages(projected, cosines, behind)
+        into_all = into_all._replace(in_view=into_all.in_view & (rays.cameras <= last)[:, None])
+    in_images = _InImages(into_all, cosines, _distance_behind(sources, into_all, chosen))
     if choice is not None and choice.views <= last:
-        weights = _weights(rays, projected, cosines, behind)
+        weights = _weights(rays, in_images)
         chosen = _highest(weights[:, list(choice.samples)].sum(1).float(), choice.views)
         in_images = in_images.of_cameras(chosen)
 
@@ -304,9 +303,7 @@ def sample_rays_torch(
     else:
         fine_with_coverage, wide = sample_level(levels, in_images.projected, RGB_MASK_COVERAGE)
         fine = fine_with_coverage[..., :RGB_MASK]
-    features = _camera_features(
-        rays, sources, *in_images[:2], fine, wide, in_images.behind, F.softsign, chosen
-    )
+    features = _camera_features(rays, sources, in_images, fine, wide, F.softsign, chosen)
 
     # How the cameras differ, and the silhouettes of the whole rig
     comparison = _compare(CameraFeatures.unstack(features))
@@ -384,7 +381,9 @@ def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
     surface = 255 * covered_depth / coverage.clamp_min(MIN_COVERAGE)  # depths were divided by 255, too
     distance = projected.z_m - surface[..., 0]
     behind = distance * (coverage[..., 0] > MIN_COVERAGE)
-    features = _camera_features(rays, sources, projected, cosines, fine, around, behind, torch.tanh)
+    features = _camera_features(
+        rays, sources, _InImages(projected, cosines, behind), fine, around, torch.tanh
+    )
 
     smallest = torch.cat(_smallest_rig_masks(sources, in_silhouettes, silhouette_side), -1)
     return RaySamples(
@@ -422,23 +421,21 @@ def _sample_with_means(
 def _camera_features(
     rays: Rays,
     sources: SourceCameras,
-    projected: Projections,
-    cosines: Float[Tensor, "ray sample view"],
+    in_images: _InImages,
     fine: Float[Tensor, "ray sample view 4"],
     wide: Float[Tensor, "ray sample view 5"],
-    behind: Float[Tensor, "ray sample view"],
     squash: Callable[[Tensor], Tensor],
     chosen: Int[Tensor, "ray view"] | None = None,
 ) -> Float[Tensor, "ray sample view 14"]:
-    """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy, metres."""
+    """`CameraFeatures` stacked, given the images sampled where the samples lie in them."""
     is_source = sources.is_source(rays.view.source_views)
     if chosen is not None:
         is_source = is_source[chosen][:, None]
-    is_source = is_source.expand_as(cosines)
-    in_view = projected.in_view.float()[..., None]
+    is_source = is_source.expand_as(in_images.cosines)
+    in_view = in_images.projected.in_view.float()[..., None]
     saturation = rays.scale.size_m * torch.tensor((NEAR, FAR), dtype=torch.double)
-    differences = squash(behind[..., None] / saturation.to(behind.device))
-    measured = torch.cat([differences, cosines[..., None]], -1).float()
+    differences = squash(in_images.behind[..., None] / saturation.to(in_images.behind.device))
+    measured = torch.cat([differences, in_images.cosines[..., None]], -1).float()
     features = torch.cat([fine, measured, is_source[..., None], in_view, wide], -1)
     return features * in_view
 
@@ -518,18 +515,13 @@ def score_cameras_torch(rays: Rays, sources: SourceCameras) -> Float[Tensor, "ra
     lines = CameraLines.of(rays, sources.cameras)
     projected = lines.project()
     behind = _distance_behind(sources, projected)
-    return _weights(rays, projected, lines.viewing_cosines(), behind).sum(1).float()
+    return _weights(rays, _InImages(projected, lines.viewing_cosines(), behind)).sum(1).float()
 
 
-def _weights(
-    rays: Rays,
-    projected: Projections,
-    cosines: Float[Tensor, "ray sample view"],
-    behind: Float[Tensor, "ray sample view"],
-) -> Float[Tensor, "ray sample view"]:
-    """Prior weights of the cameras, not normalised, by distances behind the proxy, metres."""
-    near = F.softsign(behind / (NEAR * rays.scale.size_m))
-    return projected.in_view * _closeness(cosines, near)
+def _weights(rays: Rays, in_images: _InImages) -> Float[Tensor, "ray sample view"]:
+    """Prior weights of the cameras, not normalised."""
+    near = F.softsign(in_images.behind / (NEAR * rays.scale.size_m))
+    return in_images.projected.in_view * _closeness(in_images.cosines, near)
 
 
 class CameraLines(NamedTuple):
