@@ -17,6 +17,7 @@ CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/te
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 KERNELS := $(shell find src -name '_*_numba.py')
+TYPED := $(shell find src -name '*.py')
 
 .PHONY: demo pictures performance site test test-all tests slow shapes kernels gate pyright docs format clean
 
