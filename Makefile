@@ -17,16 +17,15 @@ CHECKED := tests/laws tests/test_types.py tests/test_stream.py tests/geometry/te
 	tests/training/test_adversarial.py tests/evaluation/test_scores.py tests/metrics/test_image_quality.py \
 	tests/preprocess/test_corners.py tests/live/test_encoding.py tests/export/scene
 KERNELS := $(shell find src -name '_*_numba.py')
-TYPED := $(shell find src -name '*.py')
 
-.PHONY: demo pictures performance site test test-all tests slow shapes kernels gate pyright docs format clean
+.PHONY: demo pictures performance site test test-all tests slow shapes kernels gate types docs format clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
 
-test: gate pyright docs tests shapes ## environment, install, static checks, the documents, the tests
+test: gate types docs tests shapes ## environment, install, static checks, the documents, the tests
 
-test-all: gate pyright docs kernels ## slow tests, too, and the shapes of arrays in every call
+test-all: gate types docs kernels ## slow tests, too, and the shapes of arrays in every call
 	$(PYTEST) -m ""
 
 tests: kernels
@@ -62,12 +61,8 @@ gate: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 
-pyright: out/pyright ## not again while the package is unchanged
-
-out/pyright: .venv/installed pyproject.toml $(TYPED)
-	$(BIN)/pyright
-	mkdir -p out
-	touch $@
+types: .venv/installed
+	$(BIN)/pyrefly check
 
 format: .venv/installed
 	$(BIN)/ruff format .

@@ -157,7 +157,7 @@ def baseline(name: str, framing: str, views: list[IncompleteView], context: Cont
     """A baseline whose past repeats one frame: values do not affect its speed."""
     torch.manual_seed(0)
     network = NETWORKS[name]().to(options.device).eval()
-    config = OnlineConfig(framing=framing, sampling=Sampling(step=STEP))  # pyright: ignore
+    config = OnlineConfig(framing=framing, sampling=Sampling(step=STEP))
     inpainter = FewWindows(network, config, options.windows)
     _, first = inpainter.step(replace(views[NOW], time=NOW - 1), context, inpainter.initial_state())
     times = config.sampling.times(NOW)

@@ -67,7 +67,8 @@ class _LazyStacks:
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, stacked: what is pickled."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
+        # pyrefly: ignore[bad-argument-type]
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     if not TYPE_CHECKING:  # to a type checker, all fields are attributes
 

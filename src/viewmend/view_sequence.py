@@ -98,7 +98,7 @@ class ViewSequence:
                 self.stream = stream
                 break
         self._warm_up = None
-        self.state = made.viewer
+        self.state = made.viewer  # pyrefly: ignore[unbound-name]
         return made
 
     def skip(

@@ -65,6 +65,6 @@ def make_frame():
         pixels = {"time": 0, "width_px": 20, "height_px": 10, "hull_px": 100, "hole_px": 60, "hole_fg_px": 60}
         values = dict.fromkeys(f.name for f in fields(ViewScores)) | pixels | dict.fromkeys(ORIGIN_PX, 0)
         values |= {"psnr_whole": 30.0, "psnr_whole_rendered": 20.0}
-        return ViewScores(**(values | scores))  # pyright: ignore[reportArgumentType]
+        return ViewScores(**(values | scores))
 
     return make

@@ -72,7 +72,7 @@ def test_fine_tuning_uses_the_objective_of_its_model(start, kind, model):
     ("step", "progress", "factor"), [(5, 0.0, 0.1), (59, 0.01, 1.0), (2, 0.05, 0.5), (4, 0.1, 1.0)]
 )
 def test_warm_up_ends_after_its_steps_or_a_tenth_of_the_run(step, progress, factor):
-    found = Objective.learning_rate_factor(None, step, progress, 60)  # pyright: ignore
+    found = Objective.learning_rate_factor(None, step, progress, 60)
     cosine = 0.5 * (1 + math.cos(math.pi * progress))
     assert found == pytest.approx(factor * cosine)
 

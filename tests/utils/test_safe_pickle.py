@@ -61,7 +61,7 @@ def test_scalars_are_numbers(read, scalar):
 
 
 def test_npy_files_have_one_object(read, tmp_path):
-    np.save(tmp_path / "b.npy", {"a": [np.eye(3)]}, allow_pickle=True)  # pyright: ignore[reportArgumentType]
+    np.save(tmp_path / "b.npy", {"a": [np.eye(3)]}, allow_pickle=True)
     assert numbers(read_objects(tmp_path / "b.npy")["a"], 3, 3).tolist() == np.eye(3).tolist()
     np.save(tmp_path / "b.npy", np.eye(3))
     with pytest.raises(ValueError, match=r"got an array with the header \{'descr': '<f8'"):

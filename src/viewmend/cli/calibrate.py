@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -92,7 +92,7 @@ def _by_board(options: Options, out: Path) -> Figures:
         )
         for camera, one in zip(footage.cameras, found, strict=True)
     )
-    up = -sum(camera.R[1] for camera in cameras)
+    up: Any = -sum(camera.R[1] for camera in cameras)
     out.mkdir()
     write_calibration(out, replace(footage, cameras=cameras, up=up))
     write_image(out / "residuals.png", draw_residuals(cameras, found))

@@ -108,8 +108,10 @@ def load_named(name: str | None, device: str, precision: Precision = "auto") -> 
     from viewmend.models.registry import default_method, make_method
 
     check_device(device)
-    if name is None and (name := default_method()) == "telea":
-        say("this version ships no model: holes are filled with OpenCV's Telea inpainting")
+    if name is None:
+        name = default_method()
+        if name == "telea":
+            say("this version ships no model: holes are filled with OpenCV's Telea inpainting")
     return make_method(name, device, precision)
 
 

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from types import FrameType
 from typing import TypeVar
 
@@ -29,8 +29,8 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
 
     `total` is the number of items, by default their `len`. Without either, the bar shows activity only.
     """
-    if total is None and hasattr(items, "__len__"):
-        total = len(items)  # pyright: ignore[reportArgumentType]
+    if total is None and isinstance(items, Sized):
+        total = len(items)
     if not sys.stderr.isatty():
         start = time.monotonic()
         done = 0

@@ -70,7 +70,7 @@ def run(options: Options) -> int:
         options.out,
         images=options.images,
         progress=lambda times: track(times, "masks"),
-        read_unmasked=masked and masked.take_unmasked,
+        read_unmasked=None if masked is None else masked.take_unmasked,
     )
     if len(empty) == len(part.frame_ids):
         got = f"none in {len(empty)} frame{'s' if len(empty) > 1 else ''}"

@@ -176,7 +176,7 @@ def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarr
         if not is_opaque(alpha):
             return alpha
         channels = channels[:-1]
-    return functools.reduce(cv2.max, channels)  # pyright: ignore[reportArgumentType]
+    return functools.reduce(cv2.max, channels)
 
 
 def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:

@@ -33,7 +33,7 @@ ENTERING_FRAMES = 30
 class PreparedCapture(CaptureWrapper):
     """A source with aligned cameras, matched colours and reduced images; see `prepare`."""
 
-    source: CaptureSource
+    source: CaptureSource  # pyrefly: ignore[bad-override]
     alignment: Alignment | None = None
     """The shift of all images that was found in the masks of the input cameras; None if off or impossible."""
     max_image_size: int | None = None

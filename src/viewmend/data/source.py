@@ -133,7 +133,7 @@ class CaptureWrapper:
 class CaptureSubset(CaptureWrapper):
     """Some frames of a source, optionally with smaller images."""
 
-    source: CaptureSource
+    source: CaptureSource  # pyrefly: ignore[bad-override]
     times: range
     """Indices into the source's frames."""
     scale: float = 1.0

@@ -34,7 +34,7 @@ class Undistortion:
                 K[:2, 2] -= 0.5  # in OpenCV the centre of the first pixel is at 0
                 size = (camera.width, camera.height)
                 # Positions in fixed point, to 1/32 pixel, are three times as fast as in floats
-                maps = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, cv2.CV_16SC2)  # pyright: ignore
+                maps = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, cv2.CV_16SC2)
                 positions, fractions = maps
                 self._maps = positions, fractions
         smooth = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

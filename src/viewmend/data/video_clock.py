@@ -283,7 +283,7 @@ def _overlap(
     period_s = 1 / (reference.fps or 1.0)
     images = dict(images)
     overlapping = list(tracks)
-    moved = set()
+    moved: set[tuple[str, TrackKind]] = set()
     by_index = set()
     for number, track in enumerate(tracks):
         peer = reference if track.kind == "images" else images[track.camera]

@@ -99,8 +99,17 @@ RATE_TOLERANCE = 0.01
 NO_CHROMA_FILTER = "POINT"
 """The interpolation of chroma in images at their own size. FFmpeg does it this way for 8 bits in any
 case; other bit depths follow this choice."""
-ALPHA_OPTIONS = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
-"""Alpha is encoded as a second image. VP9's hidden reference frames would separate the two."""
+OPAQUE_OPTIONS: dict[str, object] = {"crf": "18", "preset": "veryfast"}
+"""Options of the encoder of videos without alpha."""
+ALPHA_OPTIONS: dict[str, object] = {
+    "crf": "18",
+    "b:v": "0",
+    "auto-alt-ref": "0",
+    "deadline": "realtime",
+    "cpu-used": "5",
+}
+"""Options of the encoder of videos with alpha, which is encoded as a second image; VP9's hidden
+reference frames would separate the two."""
 
 Image = UInt8[np.ndarray, "height width 3"]
 ImageWithAlpha = UInt8[np.ndarray, "height width 4"]
@@ -481,7 +490,7 @@ class VideoWriter:
         self._stream: Any = self._container.add_stream(codec, rate=rate)
         self._stream.pix_fmt = "yuva420p" if alpha else "yuv420p"
         tag_colours(self._stream.codec_context)
-        self._stream.options = ALPHA_OPTIONS if alpha else {"crf": "18", "preset": "veryfast"}
+        self._stream.options = ALPHA_OPTIONS if alpha else OPAQUE_OPTIONS
         if alpha:
             self._stream.metadata["alpha_mode"] = "1"
         self._stream.codec_context.thread_count = threads

@@ -141,7 +141,7 @@ class CellStore:
 
             def write(path: Path) -> None:
                 with path.open("wb") as file:
-                    np.savez(file, **features)  # pyright: ignore[reportArgumentType]
+                    np.savez(file, **features)  # pyrefly: ignore[bad-argument-type]
 
             write_atomically(self.folder / f"{stem}.npz", write)
 

@@ -60,8 +60,10 @@ def load_scorers(background: Background, ssim: SsimWindow, networks: Sequence[st
     Raises:
         WeightsError: weights are missing or wrong.
     """
-    loaded = {field: load(device) for name, (field, load) in NETWORKS.items() if name in networks}
-    return Scorers(background, ssim, **loaded)  # pyright: ignore[reportArgumentType]
+    loaded: dict[str, Any] = {
+        field: load(device) for name, (field, load) in NETWORKS.items() if name in networks
+    }
+    return Scorers(background, ssim, **loaded)
 
 
 def available_networks() -> tuple[tuple[str, ...], dict[str, str]]:

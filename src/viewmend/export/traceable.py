@@ -194,8 +194,8 @@ class PackedSources(SourceCameras):
     """The source cameras of an exported model's inputs, with pyramids of a fixed number of levels."""
 
     coloured: Bool[Tensor, "view"]
-    use_kernels = False  # pyright: ignore
-    rays_at_once = None  # pyright: ignore
+    use_kernels = False
+    rays_at_once = None
 
     @classmethod
     def of_inputs(cls, inputs: ViewInputs) -> "PackedSources":

@@ -37,7 +37,7 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
 
     # The number of each block's part, from 1; blocks that share a corner are connected.
     occupied = grid.summary.blocks
-    labels, count = label(occupied.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels, count = label(occupied.numpy(), np.ones((3, 3, 3)))
     if count < 2:
         return grid
 
@@ -76,7 +76,7 @@ def filled_box(grid: OccupancyGrid) -> Box | None:
     ]
     if max(beyond) <= shell:
         return filled
-    labels, _ = label(grid.summary.faint_blocks.numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    labels, _ = label(grid.summary.faint_blocks.numpy(), np.ones((3, 3, 3)))
     connected = np.unique(labels[grid.summary.blocks.numpy()])
     of_blocks = filled_sides(torch.from_numpy(np.isin(labels, connected)))
     assert of_blocks is not None, "there are voxels inside"

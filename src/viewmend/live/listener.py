@@ -29,7 +29,7 @@ class Server:
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(
                 self.limits.wrap(server.app()),
-                http=self.limits.connect,  # pyright: ignore[reportArgumentType]
+                http=self.limits.connect,  # pyrefly: ignore[bad-argument-type]
                 ws="websockets-sansio",
                 ws_max_size=MAX_FRAME_BYTES,  # the limits of a viewer's and a rig's messages are lower
                 ws_ping_interval=45.0,  # proxies close what is silent for a minute

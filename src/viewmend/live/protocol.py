@@ -237,7 +237,7 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
     """Convert JSON text, or parsed JSON, to `kind`, as `untrusted_input.typed`; ProtocolError if it does not match."""
     if isinstance(message, str | bytes):
         opening = ("[", "{") if isinstance(message, str) else (b"[", b"{")
-        nested = sum(map(message.count, opening))  # pyright: ignore[reportArgumentType]
+        nested = sum(map(message.count, opening))
         if nested > MAX_NESTED:
             raise ProtocolError(
                 f"expected at most {MAX_NESTED} lists and objects in a message, got {nested}; send fewer"

@@ -102,7 +102,7 @@ def load_lpips(backbone: Backbone = "alex", device: torch.device | str = "cpu") 
     path = checked_weights(known_weights(f"lpips-{backbone}"))
     network = load_weights(construct(Lpips, backbone), path, device).requires_grad_(False)
     # A fifth faster on CPUs.
-    return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return network.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
 
 
 def _alexnet() -> nn.Sequential:

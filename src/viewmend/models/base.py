@@ -306,7 +306,8 @@ class Inpainter:
                 "another model"
             )
         completed, state = made
-        completed = replace(completed, **{name: image.float() for name, image in completed.images.items()})
+        images: dict[str, Any] = {name: image.float() for name, image in completed.images.items()}
+        completed = replace(completed, **images)
         return cut(from_background(given, completed, view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:

@@ -187,7 +187,7 @@ def identity(inpainter: object) -> str:
     if is_dataclass(inpainter) and not isinstance(inpainter, type):
         return f"{_class(inpainter)}({identity({f.name: getattr(inpainter, f.name) for f in fields(inpainter)})})"
     if callable(inpainter) and hasattr(inpainter, "__qualname__"):
-        return f"{getattr(inpainter, '__module__', '')}.{inpainter.__qualname__}"  # pyright: ignore
+        return f"{getattr(inpainter, '__module__', '')}.{inpainter.__qualname__}"
     return f"{_class(inpainter)}({identity(dict(vars(inpainter)) if hasattr(inpainter, '__dict__') else {})})"
 
 

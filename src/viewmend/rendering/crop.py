@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Shaped
@@ -49,14 +50,18 @@ class Crop:
         """This part of a view."""
         if self == Crop.all_of(view.camera):
             return view
-        images = {name: self.of_image(image).contiguous() for name, image in _images(view).items()}
+        images: dict[str, Any] = {
+            name: self.of_image(image).contiguous() for name, image in _images(view).items()
+        }
         return replace(view, camera=self.of_camera(view.camera), **images)
 
     def uncropped(self, part: IncompleteView, camera: Cameras) -> IncompleteView:
         """The whole view of `camera`: black, and without subject, around this part."""
         if self == Crop.all_of(camera):
             return part
-        whole = {name: self.uncropped_image(image, camera) for name, image in _images(part).items()}
+        whole: dict[str, Any] = {
+            name: self.uncropped_image(image, camera) for name, image in _images(part).items()
+        }
         return replace(part, camera=camera, **whole)
 
     def pasted(self, part: CompletedView, view: IncompleteView) -> CompletedView:

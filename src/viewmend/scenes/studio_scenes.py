@@ -90,7 +90,9 @@ class StudioScene(LeaveOneOutScene):
         config = self.config
         if self.tempo is None:
             return Studio(config)
-        alone = {} if self.motion is None else {"motion": self.motion, "people": 1, "furniture": False}
+        alone: dict[str, Any] = (
+            {} if self.motion is None else {"motion": self.motion, "people": 1, "furniture": False}
+        )
         return Studio(config, procedural_scene(config.seed, style=PerformerStyle(tempo=self.tempo, **alone)))
 
     def frames(self) -> Iterator[LeaveOneOutFrame]:

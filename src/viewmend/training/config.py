@@ -105,6 +105,7 @@ class SamplingConfig:
     """Views with fewer pixels to inpaint are skipped."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class ObjectiveConfig(ABC):
     """What a run trains and by which loss.
 

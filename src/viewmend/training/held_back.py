@@ -290,10 +290,10 @@ class HeldBackValidation:
         if not self._views:
             raise ValueError("expected a subject in what is held back, got none; choose another --hold-out")
         self._metric = self._metric or load_lpips("alex")
-        training = model.training  # pyright: ignore
-        model.eval()  # pyright: ignore
+        training = model.training
+        model.eval()
         made = [view.score(model, self._metric) for view in self._views]
-        model.train(training)  # pyright: ignore
+        model.train(training)
         background = model.background or "black"
         rows = [
             _row(view, [("tuned", own)], background) for view, (_, own) in zip(self._views, made, strict=True)
@@ -393,7 +393,7 @@ def _row(
     view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background
 ) -> list[Tile]:
     """The view as rendered, as completed, and the truth, cut to the subject."""
-    box = _subject_box(view.truth.mask[0])  # pyright: ignore[reportOptionalSubscript]
+    box = _subject_box(view.truth.mask[0])  # pyrefly: ignore[unsupported-operation]
     images = [("rendered", completed[0][1].view.rgb), *((name, own.rgb) for name, own in completed)]
     images.append(("truth", camera_image(view.truth, background)))
     return [Tile(f"{view.camera}: {name}", picture(image[:, *box])) for name, image in images]

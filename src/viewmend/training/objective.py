@@ -122,7 +122,7 @@ class Objective(nn.Module, Generic[Model]):
 
     def save(self, model: nn.Module, folder: Path, card: str) -> None:
         """Write a model of this objective, usually the averaged one, with its card."""
-        save_inpainter(model, folder, card)  # pyright: ignore[reportArgumentType]
+        save_inpainter(model, folder, card)  # pyrefly: ignore[bad-argument-type]
 
 
 def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", optional: str = "") -> None:

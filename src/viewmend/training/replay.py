@@ -110,7 +110,7 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
         loader = DataLoader(
             numbered,
             batch_size=None,
-            sampler=count(first),  # pyright: ignore[reportArgumentType]
+            sampler=count(first),
             num_workers=workers,
             prefetch_factor=2,
             collate_fn=_to_bytes,

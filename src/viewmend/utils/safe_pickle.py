@@ -37,7 +37,7 @@ class Stored:
             _, shape, dtype, fortran, data = state
             self.value = _make_array(data, dtype, shape, "F" if fortran else "C")
         elif (order := _text(state[1])) in "<>":
-            self.dtype = self.dtype.newbyteorder(order)  # pyright: ignore[reportArgumentType]
+            self.dtype = self.dtype.newbyteorder(order)  # pyrefly: ignore[bad-argument-type]
 
 
 def read_objects(file: Path) -> Any:

@@ -81,7 +81,7 @@ def read_json(text: str | bytes) -> Any:
             takes too long.
     """
     opening = (b"[", b"{") if isinstance(text, bytes) else ("[", "{")
-    parts = sum(map(text.count, opening))  # pyright: ignore[reportArgumentType]
+    parts = sum(map(text.count, opening))
     if parts > MOST_PARTS:
         raise ValueError(
             f"expected JSON of at most {MOST_PARTS} lists and objects, got {parts}; is it the right file?"

@@ -118,7 +118,7 @@ def test_flow_of_untrained_weights_has_the_images_size_and_scale():
         for parameter in flow.parameters():
             parameter.zero_()
         # Of the last level alone: a constant (32, 64) at 64 x 128, where the network works, is (27, 60) at 54 x 120.
-        last = flow.basic_module[-1].basic_module[-1]["conv"]  # pyright: ignore
+        last = flow.basic_module[-1].basic_module[-1]["conv"]
         last.bias.copy_(torch.tensor([64.0, 32.0]))
         out = flow(torch.rand(1, 3, 54, 120), torch.rand(1, 3, 54, 120))
     assert out.shape == (1, 2, 54, 120)

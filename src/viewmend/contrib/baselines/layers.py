@@ -90,7 +90,7 @@ class FrameDecoder(nn.Sequential):
             nn.Conv2d(64, 3, 3, 1, 1),
         )
 
-    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(  # pyrefly: ignore[bad-override-param-name]
         self, features: Float[Tensor, "frame 128 rows cols"]
     ) -> Float[Tensor, "frame 3 height width"]:
         """Frames of four times the size, in [-1, 1]."""

@@ -45,7 +45,8 @@ def make_baseline(name: str, device: torch.device | str = "cpu") -> Inpainter:
     if found:
         network = load_baseline(found["network"], found["weights"] or "", device)
         sampling = Sampling(grid="relative" if found["grid"] else "absolute")
-        config = OnlineConfig(framing=found["framing"], sampling=sampling)  # pyright: ignore[reportArgumentType]
+        # pyrefly: ignore[bad-argument-type]
+        config = OnlineConfig(framing=found["framing"], sampling=sampling)
         return OnlineInpainter(network, config)
     raise ValueError(f"expected a name like dstt-o-def, got '{name}'; the networks are {', '.join(NETWORKS)}")
 

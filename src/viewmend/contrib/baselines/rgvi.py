@@ -178,7 +178,7 @@ def make_rgvi(device: torch.device | str = "cpu") -> Rgvi:
         return Rgvi()
     path = checked_weights(weights)
     try:
-        from torchvision.models.optical_flow import raft_large  # pyright: ignore[reportMissingImports]
+        from torchvision.models.optical_flow import raft_large
     except ImportError:
         raise ValueError(f"expected torchvision to run {path}, found none; pip install torchvision") from None
     return Rgvi(partial(raft_flow, load_weights(construct(raft_large), path, device)))

@@ -146,7 +146,7 @@ class DecoupledBlock(TokenBlock):
     def __init__(self, temporal: bool) -> None:
         # The feed-forward's keys are `conv.0` and `conv.3`; the official dropout between them is inactive.
         layers = nn.Linear(DIM, HIDDEN), nn.ReLU(inplace=True), nn.Identity(), nn.Linear(HIDDEN, DIM)
-        super().__init__(nn.Sequential(OrderedDict(conv=nn.Sequential(*layers))))
+        super().__init__(nn.Sequential(OrderedDict[str, nn.Module](conv=nn.Sequential(*layers))))
         self.temporal = temporal
 
     def forward(self, tokens: TokenClips) -> TokenClips:

@@ -104,9 +104,9 @@ class HlsSegmenter:
 
         if picture.shape[1::-1] != self._size_px:
             picture = cv2.resize(picture, self._size_px, interpolation=cv2.INTER_LINEAR)
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24").reformat(
-            format="yuv420p"
-        )
+        # pyrefly: ignore[bad-argument-type]
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        frame = frame.reformat(format="yuv420p")
         frame.pts = at
         frame.time_base = Fraction(1, self._fps)
         second = at // self._fps

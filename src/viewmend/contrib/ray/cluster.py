@@ -40,7 +40,7 @@ def find_ray(address: str) -> Any:
     for name, value in wanted.items():
         os.environ.setdefault(name, value)
     try:
-        import ray  # pyright: ignore[reportMissingImports]
+        import ray
     except ImportError as error:
         raise ValueError(
             "expected Ray for --ray, got none; install viewmend's extra 'ray', or omit --ray"

@@ -114,11 +114,11 @@ class RayIngest:
         return None if found is None else (found[0], self._answer(found[1][0], wait_s))
 
     def _answer(self, reference: Any, wait_s: float) -> Any:
-        import ray  # pyright: ignore[reportMissingImports]
-        from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
+        import ray
+        from ray.exceptions import RayError
 
         try:
-            return ray.get(reference, timeout=wait_s + ANSWER_S)  # pyright: ignore
+            return ray.get(reference, timeout=wait_s + ANSWER_S)
         except RayError as error:
             raise ConnectionError(" ".join(str(error).split())[:200]) from error
 
@@ -136,7 +136,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
     ray = find_ray(address)
     logging.getLogger("ray").setLevel(logging.ERROR)
     connect(ray, address, num_cpus=served.replicas[1] + 1, object_store_memory=int(1e6 * served.store_mb))
-    from ray import serve  # pyright: ignore
+    from ray import serve
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
     try:
@@ -230,9 +230,9 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
 
 def _put(shared: SharedFrame) -> list[Any]:
     """Store a frame; its reference is in a list so that Ray does not resolve it for the caller."""
-    import ray  # pyright: ignore[reportMissingImports]
+    import ray
 
-    return [ray.put(shared)]  # pyright: ignore
+    return [ray.put(shared)]
 
 
 def _demand_no_serve(ray: Any) -> None:

@@ -121,7 +121,7 @@ def read_storage(file: Path) -> dict[str, Any]:
         entries = {child.tag: _xml_value(child) for child in read_xml(data)}
     else:
         entries = _read_yaml(decode_text(data, file.name), file.name)
-    found = {}
+    found: dict[str, Any] = {}
     for key, value in entries.items():
         if key == "names":
             found[key] = [name for name in value if isinstance(name, str)] if isinstance(value, list) else []

@@ -120,7 +120,7 @@ def _camera(folder: Path, camera: _Camera, frames: list[str]) -> dict[str, Any]:
     view = np.array(camera.extrinsics.view_matrix).reshape(4, 4)
     K = np.array(camera.intrinsics.camera_matrix).reshape(3, 3)
     size = camera.intrinsics.resolution
-    entry = {"name": name, "width": size[0], "height": size[1], "K": K.tolist()}
+    entry: dict[str, Any] = {"name": name, "width": size[0], "height": size[1], "K": K.tolist()}
     entry |= {"R": view[:3, :3].tolist(), "t": view[:3, 3].tolist()}
     entry["dist"] = to_distortion(name, camera.intrinsics.distortion_coefficients)
     entry["image"] = _pattern(folder, f"rgb/rgb_{name}", frames, (".jpeg", ".jpg", ".png"))

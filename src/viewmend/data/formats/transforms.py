@@ -255,7 +255,7 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
                     f"expected equal 'time' for equal numbers in {key}, got others; round them alike"
                 )
         cameras.append((structs.replace(entries[0], **patterns), entries[0]))
-    return cameras, tuple(ids[time] for time in sorted(times))  # pyright: ignore[reportArgumentType]
+    return cameras, tuple(ids[time] for time in sorted(times))  # pyrefly: ignore[bad-specialization]
 
 
 def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str, Any]:

@@ -106,7 +106,8 @@ def collate(
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
         parts = [_carry(frames, target.view, config)] if frames else []
         parts.append((uvs[~target.incomplete], valid[~target.incomplete]))
-        key_positions.append(tuple(torch.cat(values) for values in zip(*parts, strict=True)))
+        uv, is_valid = zip(*parts, strict=True)
+        key_positions.append((torch.cat(uv), torch.cat(is_valid)))
         keys.append([*(frame.keys_values.to(own) for frame in frames), own])
     # At least one key, although it is not present: kernels do not accept empty tensors.
     num_keys = max(1, *(sum(part.shape[2] for part in parts) for parts in keys))

@@ -147,7 +147,7 @@ class ViewSynthNet(Network):
     The rim is a band of few pixels around the proxy that the subject may also cover (`geometry.rim`).
     """
 
-    config: ViewsConfig  # pyright: ignore
+    config: ViewsConfig
     trained_in_bfloat16 = True
     error_rule = "all"
     """The whole subject is predicted: the model learned to keep the pixels that are already correct."""
@@ -156,7 +156,7 @@ class ViewSynthNet(Network):
     def __init__(self, config: ViewsConfig | None = None) -> None:
         super().__init__()
         config = config or ViewsConfig()
-        self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.config = config
 
         # The coarse fill of holes, and the predictor of errors
         self.coarse = None
@@ -383,6 +383,7 @@ class ViewSynthNet(Network):
             samples = sample_rays(chunk, sources, step_px=float(CELL_PX), choice=choice)
             parts.append(self.sample_aggregator(samples))
             cameras.append(samples.cameras)
+        # pyrefly: ignore[bad-argument-type]
         chosen = cameras[0] if len(cameras) == 1 or cameras[0] is None else torch.cat(cameras)
         return AggregatedSamples.cat(parts), chosen
 

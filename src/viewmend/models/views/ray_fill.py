@@ -104,13 +104,13 @@ class RayInputs(NamedTuple):
 class RayFill(Network, Fill):
     """Weighs the candidates of each missing pixel."""
 
-    config: RaysConfig  # pyright: ignore
+    config: RaysConfig
     margin_px = MARGIN_PX
 
     def __init__(self, config: RaysConfig | None = None) -> None:
         super().__init__()
         config = config or RaysConfig()
-        self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.config = config
         width = config.width
         deep = 2 * width
 

@@ -70,7 +70,7 @@ class Rays:
         """Chunks of `size` rays; None gives one chunk."""
         if size is None:
             return [self]
-        parts = []
+        parts: list[Rays] = []
         for first in range(0, max(1, len(self.cells)), size):
             own = slice(first, first + size)
             cameras = None if self.cameras is None else self.cameras[own]

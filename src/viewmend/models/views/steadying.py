@@ -90,7 +90,7 @@ def steadying_change(now: Channels, before: Channels) -> Channels:
     """The change of a view that reduces flicker, given the last view in the same image coordinates."""
     height, width = now.shape[:2]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = search.calc(_grey(now), _grey(before), None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    flow = search.calc(_grey(now), _grey(before), None)  # pyrefly: ignore[no-matching-overload]
     flow_px = np.asarray(flow, np.float32)
     x_px = np.arange(width, dtype=np.float32) + flow_px[..., 0]
     y_px = np.arange(height, dtype=np.float32)[:, None] + flow_px[..., 1]

@@ -227,6 +227,7 @@ def open_footage(folder: Path) -> NativeCalibration:
         raise CaptureError(f"{folder}: {error}") from None
     nothing: dict[str, Any] = {"K": np.eye(3), "R": np.eye(3), "t_m": np.zeros(3), "dist": np.zeros(5)}
     nothing |= dict.fromkeys(FILE_KINDS)
+    # pyrefly: ignore[bad-argument-type]
     cameras = tuple(NativeCamera(name=name, **(nothing | footage.entries[name])) for name in chosen)
     return NativeCalibration(footage.frames, cameras, None, footage.fps, None, 1.0, folder, folder)
 

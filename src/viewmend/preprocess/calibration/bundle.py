@@ -116,7 +116,7 @@ def _calibrate_alone(
     points = [board.corners_m[c.ids].astype(np.float32)[None] for c in own]
     pixels = [c.pixels.astype(np.float32)[None] for c in own]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
-    _, K, dist, *_ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)  # pyright: ignore
+    _, K, dist, *_ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
     return np.asarray(K), np.asarray(dist).ravel()[:5]
 
 
