@@ -22,6 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from viewmend.live import connection, connection_limits
 from viewmend.live.client import Client
 from viewmend.live.protocol import Limits
+from viewmend.live.sessions import ViewerSession
 
 
 def malformed(chance: random.Random):
@@ -78,6 +79,23 @@ def test_clients_that_break_the_protocol_are_disconnected(ball):
             huge.send("x" * 2_000_000)
         # None: unread input can make the system drop the connection before the close code is read.
         assert close_code(huge) in (1009, None)
+    assert ball.is_serving()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("dictionary changed size"), KeyError("a field")])
+def test_a_fault_of_the_server_is_logged_and_ends_the_connection(ball, monkeypatch, caplog, error):
+    """Any exception is: torch, too, raises RuntimeErrors, which do not mean that the client has gone."""
+
+    def fail(*_):
+        raise error
+
+    with open_websocket(ball) as unlucky:
+        say_hello(unlucky)
+        monkeypatch.setattr(ViewerSession, "look", fail)
+        unlucky.send('{"type": "look", "id": 1}')
+        close_code(unlucky)
+    wait_until(lambda: type(error).__name__ in caplog.text)
+    monkeypatch.undo()
     assert ball.is_serving()
 
 

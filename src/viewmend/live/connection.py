@@ -145,8 +145,8 @@ class ViewerConnection:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
                 async with asyncio.timeout(2):
                     await close_with_error(self._socket, closing.code, closing.message)
-        except (WebSocketDisconnect, RuntimeError):
-            pass  # the client has gone; starlette raises a RuntimeError when more is sent to it
+        except WebSocketDisconnect:
+            pass  # the client has gone
         finally:
             self._service.leave(self._session)
             with self._service.lock:
@@ -186,7 +186,7 @@ class ViewerConnection:
             "background": self._service.renderer.background,
             "codecs": [codec for codec in about["codecs"] if codec in ("jpeg", *hello.codecs)],
         }
-        await self._socket.send_text(json.dumps(welcome))
+        await self._send(json.dumps(welcome))
 
     async def _serve(self) -> None:
         tasks = [asyncio.create_task(work()) for work in (self._read, self._write)]
@@ -282,11 +282,21 @@ class ViewerConnection:
                 while self._pending:
                     oldest = next(iter(self._pending))
                     message = self._pending.pop(oldest)
-                    await self._socket.send_text(json.dumps(message))
+                    await self._send(json.dumps(message))
                 if self._frame is not None:
                     frame = self._frame
                     self._frame = None  # the render thread may set the next one while this one is sent
-                    await self._socket.send_bytes(frame)
+                    await self._send(frame)
+
+    async def _send(self, data: str | bytes) -> None:
+        """Send a message, as text or binary; WebSocketDisconnect if the client has gone."""
+        try:
+            if isinstance(data, str):
+                await self._socket.send_text(data)
+            else:
+                await self._socket.send_bytes(data)
+        except RuntimeError:  # from starlette, when more is sent on a closed socket
+            raise WebSocketDisconnect from None
 
     def send_due(self, shared: SharedState) -> float:
         """Send the messages that are due, and end the connection if a frame was not acknowledged in time.

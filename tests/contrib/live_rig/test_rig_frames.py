@@ -119,6 +119,18 @@ def test_a_camera_that_was_replaced_delivers_nothing_more(rig):
     assert len(supply._aligner.take(taken_s + 60)) == 1
 
 
+def test_the_default_tolerance_is_half_an_interval_of_the_rate_in_use(rig):
+    """The rig's file says 10 fps; at 5 fps, no image is farther than 0.1 s from its tick."""
+    supply = RigFileSource(rig, fps=5.0, align=False)
+    images = CameraImages(np.zeros((48, 48, 3), np.uint8), np.zeros((48, 48), np.uint8), depth=None)
+    start_s = time.monotonic() - 10
+    supply._add_image(supply._workers["c0"], start_s, images)
+    supply._add_image(supply._workers["c1"], start_s + 0.09, images)
+    assert supply._aligner.counts["c1"]["misaligned"] == 0
+    [group] = supply._aligner.take(start_s + 60)
+    assert set(group.by_camera) == {"c0", "c1"}
+
+
 def test_recordings_that_do_not_overlap_are_an_error_of_the_rig(rig, monkeypatch):
     def apart(_):
         raise ValueError("expected recordings that overlap in time, got none")

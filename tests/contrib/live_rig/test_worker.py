@@ -3,6 +3,7 @@
 import itertools
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -105,6 +106,27 @@ def test_a_mask_that_fails_costs_one_picture(camera):
     with working(camera, connect, lambda *_: delivered.set(), _masks=Masks()) as worker:
         assert delivered.wait(WAIT_S)
     assert worker.counts["refused"] == 1 and worker.error == "out of memory"
+
+
+def test_colours_are_corrected_as_the_calibration_says(camera):
+    """As in a capture; masks are made before, because a clean plate has the camera's own colours."""
+    delivered = []
+    masked = []
+
+    class Masks:
+        def mask(self, rgb):
+            masked.append(int(rgb[0, 0, 0]))
+            return np.zeros(rgb.shape[:2], np.uint8)
+
+    def connect(worker):
+        yield DecodedImage(frame(), 0.0)
+        worker.wait(WAIT_S)
+
+    halved = np.array([[0, 0.5, 0], [0, 1, 0], [0, 1, 10]])
+    corrected = replace(camera, calibration=replace(camera.calibration, colour=halved))
+    with working(corrected, connect, lambda *images: delivered.append(images[2]), _masks=Masks()):
+        wait_until(lambda: delivered)
+    assert delivered[0].rgb[24, 24].tolist() == [100, 200, 210] and masked == [200]
 
 
 def test_a_slow_mask_costs_pictures_and_never_delay(camera):

@@ -127,10 +127,13 @@ class LiveRig:
     """Lowest and highest corner of the subject's volume; None if the calibration has none."""
 
 
-def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
+def read_rig(path: Path, max_image_size: int | None = None, fps: float | None = None) -> LiveRig:
     """Read a `rig.toml` and its calibration.
 
-    The calibration is for images whose longer side is reduced to `max_image_size`.
+    Args:
+        path: the file.
+        max_image_size: the calibration is for images whose longer side is reduced to this many pixels.
+        fps: overrides the file's frame rate.
 
     Raises:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
@@ -155,13 +158,14 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     if unknown:
         expected = f"expected cameras that {calibration.file} has ({', '.join(known)})"
         raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
-    half_interval_s = 0.5 / rig.fps
+    rate = fps or rig.fps
+    half_interval_s = 0.5 / rate
     return LiveRig(
         name=rig.name or folder.name,
         cameras=tuple(
             _camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras
         ),
-        fps=rig.fps,
+        fps=rate,
         tolerance_s=half_interval_s if rig.tolerance_ms is None else rig.tolerance_ms / 1000,
         wait_s=rig.wait_ms / 1000,
         up=calibration.up,

@@ -97,7 +97,7 @@ class RigFileSource(LiveSource):
         """The cameras' event counts at the last report."""
         self._prepared: PreparedCapture | None = None
         """The rig with its alignment and colour matching; None before its first frame."""
-        self._switch_to(read_rig(path, max_image_size))
+        self._switch_to(read_rig(path, max_image_size, fps))
         self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
 
     def start(self) -> None:
@@ -151,9 +151,9 @@ class RigFileSource(LiveSource):
             if timecode_note is not None:
                 log.warning("%s", timecode_note)
 
-        # `--fps` overrides the file's rate. Unchanged cameras keep their event counts.
+        # Unchanged cameras keep their event counts.
         names = tuple(camera.name for camera in rig.cameras)
-        aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
+        aligner = Aligner(names, 1 / rig.fps, rig.tolerance_s, rig.wait_s)
         with self._cameras_lock:
             aligner.counts.update({name: self._aligner.counts[name] for name in kept})
             self._rig = rig
@@ -271,7 +271,7 @@ class RigFileSource(LiveSource):
             return
         self._stamp = stamp
         try:
-            self._switch_to(read_rig(self._path, self._max_image_size))
+            self._switch_to(read_rig(self._path, self._max_image_size, self._fps))
         except Exception as error:  # the thread goes on, whatever happens while files are being replaced
             log.warning("the rig stays as it was: %s", str(error) or type(error).__name__)
             return

@@ -13,6 +13,7 @@ import numpy as np
 from viewmend.contrib.live_rig.frame_readers import DecodedImage
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.camera_images import CameraImages
+from viewmend.data.camera_reader import colour_curves
 from viewmend.data.errors import CaptureError
 from viewmend.data.undistortion import Undistortion
 from viewmend.data.videos import is_turned
@@ -101,6 +102,8 @@ class CameraWorker:
         """Why no images are delivered, or the last fault of an image since connecting; None if neither."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
+        colour = camera.calibration.colour
+        self._curves = None if colour is None else colour_curves(colour)
         self._connect = connect
         self._deliver = deliver
         self._wants = wants
@@ -190,7 +193,10 @@ class CameraWorker:
             self._deliver(self, decoded.taken_s, images)
 
     def _process(self, decoded: DecodedImage) -> CameraImages:
-        """The reduced and undistorted image with its mask; ValueError if its size is not the calibration's."""
+        """The image with its mask, reduced, with corrected colours and undistorted.
+
+        ValueError if its size is not the calibration's.
+        """
         import cv2
 
         frame = decoded.frame
@@ -207,7 +213,10 @@ class CameraWorker:
         rgb = decoded.to_rgb(size_px)
         mask = self._masks.mask(reduce_image(rgb, mask_size_px(self.camera)))
         full_mask = np.asarray(cv2.resize(mask, size_px), np.uint8)
-        return self._undistortion.apply(CameraImages(rgb, full_mask, depth=None))
+
+        # Colours are corrected after masking, because a clean plate has the camera's own colours
+        corrected = rgb if self._curves is None else np.asarray(cv2.LUT(rgb, self._curves), np.uint8)
+        return self._undistortion.apply(CameraImages(corrected, full_mask, depth=None))
 
     def _receive(self, decoded: DecodedImage) -> None:
         """Hand a new image to the other thread if it is wanted, in place of one that still waits there."""
