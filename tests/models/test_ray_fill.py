@@ -12,7 +12,7 @@ from viewmend.models.compositing import blend
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views import ray_fill
 from viewmend.models.views.config import CONTRAST
-from viewmend.models.views.pyramids import SourceCameras
+from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import (
     CELLS,
     CELLS_AROUND,
@@ -20,6 +20,7 @@ from viewmend.models.views.ray_fill import (
     RADIUS_PX,
     gather_ray_inputs,
     multi_scale_context,
+    sample_behind_proxy,
 )
 from viewmend.models.views.sampler import CameraFeatures
 
@@ -91,6 +92,16 @@ def test_depth_in_holes_is_optional():
     assert torch.allclose(
         blind.rgb, net(incomplete, None) * incomplete.error + (1 - incomplete.error) * incomplete.rgb
     )
+
+
+def test_a_pixel_without_depth_takes_it_from_its_surroundings():
+    incomplete = view(5)
+    scale = SceneScale.of(incomplete)
+    pixels = torch.nonzero(incomplete.error > 0)
+    holed = replace(incomplete, depth=incomplete.depth * (incomplete.error == 0))
+    expected = sample_behind_proxy(incomplete, pixels, SOURCES, scale=scale)
+    found = sample_behind_proxy(holed, pixels, SOURCES, scale=scale)
+    assert torch.allclose(found.features, expected.features, atol=0.02), "the plate is flat"
 
 
 @torch.no_grad()
