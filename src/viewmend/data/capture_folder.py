@@ -124,7 +124,7 @@ class CaptureFolder:
         """The cameras in use, before undistortion."""
         self.cameras = pinhole_cameras(self._native_cameras)
         self.clock = read_clock(calibration)
-        """When the videos' frames were taken; None for a capture of images."""
+        """When the frames were taken; None for a capture of images without offsets (see `read_clock`)."""
         self._num_listed = len(calibration.frames)
         num_frames = self._num_listed if self.clock is None else len(self.clock.times_s)
         self.frame_ids = calibration.frames[:num_frames]
@@ -199,7 +199,8 @@ class CaptureFolder:
         frame = stack_images(list(by_view.values()), cameras, time)
         if frame.mask is not None:
             frame = self._with_opaque_masks(frame)
-        if frame.mask is not None and not frame.has_subject:  # only noise, such as that of a compressed video
+        # A mask without a subject may still contain noise, such as that of a compressed video
+        if frame.mask is not None and not frame.has_subject:
             frame = replace(frame, mask=torch.zeros_like(frame.mask))
         return frame
 
@@ -283,7 +284,7 @@ class CaptureFolder:
             kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
         ]
 
-        # A file of the first frame is named as an example; it is missing if `absent` is not empty
+        # The message names a file of the first frame as an example: one of an absent kind, if there is any
         if absent:
             example: FileKind = absent[0]
             wanted = f"the camera's {example} in at least one frame"
@@ -306,7 +307,7 @@ class CaptureFolder:
             kind for kind in kinds if all(reader.lacks(kind, time, exists) for reader in readers[kind])
         ]
 
-        # A file is named as an example; it is missing if `absent` is not empty
+        # The message names a file as an example: one of an absent kind, if there is any
         if absent:
             example: FileKind = absent[0]
             wanted = "this file or another camera's"
@@ -353,20 +354,20 @@ def _with_masks_from(
 
 
 def _without_masks(cameras: Sequence[NativeCamera]) -> tuple[str, ...]:
-    """The cameras without masks, if at least two others have some."""
+    """Names of the cameras without masks, if at least two others have masks; otherwise none."""
     unmasked = tuple(camera.name for camera in cameras if camera.mask is None)
     return unmasked if len(cameras) - len(unmasked) >= 2 else ()
 
 
 def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:
-    """The camera with its images as masks; raises a CaptureError if none of its images has alpha."""
+    """The camera with the alpha channel of its images as masks; CaptureError if none of its images has alpha."""
     if camera.image is None:
         where = f"{folder}: camera '{camera.name}'"
         raise CaptureError(f"{where}: expected images with alpha, got a video; use another source of masks")
     files = [folder / camera.file("image", frame) for frame in frames]
     existing = [file for file in files if file.is_file()]
     if existing and not any(uses_alpha(file) for file in existing):
-        # Reading the first image raises the error: it has no alpha, or cannot be read
+        # This raises the error for the first image, which has no alpha or cannot be read
         read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")
     return replace(camera, mask=camera.image)
 
@@ -394,9 +395,8 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     videos: dict[tuple[str, str], Path] = {}
     for camera in cameras:
         for kind, path in (("images", camera.video), ("masks", camera.mask)):
-            file = calibration.folder / (path or "")
-            if path and is_video(path) and file.is_file():
-                videos[camera.name, kind] = file
+            if path and is_video(path) and (calibration.folder / path).is_file():
+                videos[camera.name, kind] = calibration.folder / path
     if not videos and not any(camera.offset_ms for camera in cameras):
         return None
     fps = calibration.fps or next((video_properties(file).fps for file in videos.values()), None)
@@ -410,7 +410,7 @@ def read_clock(calibration: NativeCalibration) -> VideoClock | None:
             video = videos.get((camera.name, kind))
             if video is not None:
                 tracks.append(video_track(camera.name, kind, video, offset_s))
-            elif kind == "images":  # numbered masks follow their images
+            elif kind == "images":  # numbered masks need no track: they have the times of the images
                 tracks.append(Track(camera.name, kind, numbered_times_s, fps, offset_s))
     try:
         return match_tracks(tracks)

@@ -36,7 +36,7 @@ Matrix = tuple[Triple, Triple, Triple]
 
 
 class _CameraEntry(Struct, frozen=True, kw_only=True):
-    """An entry of `cameras` in a `cameras.json`."""
+    """An entry of `cameras` in a `cameras.json`; docs/capture-format.md describes the keys."""
 
     name: Text
     width: Pixels
@@ -77,7 +77,7 @@ class _CameraEntry(Struct, frozen=True, kw_only=True):
 
 
 class _Content(Struct, frozen=True, kw_only=True):
-    """The content of a `cameras.json`."""
+    """The content of a `cameras.json`; docs/capture-format.md describes the keys."""
 
     format: str
     first_pixel_center: tuple[Number, Number] = (0.0, 0.0)
@@ -125,9 +125,10 @@ class NativeCamera:
     mask: str | None
     """Path of its masks, as for images, or of a video of masks; None if it has none."""
     depth: str | None
-    """Path of its depth images, as for images; None if it has none."""
+    """Path of its depth images (16-bit PNG, z-depth in millimetres), as for images; None if it has none."""
     colour: Float64[np.ndarray, "3 3"] | None = None
-    """Coefficients a, b, c of red, green and blue: a value x in 0..255 becomes a x^2 + b x + c."""
+    """A row of coefficients a, b, c for each of red, green and blue: a value x in 0..255 becomes
+    a x^2 + b x + c. None if colours stay unchanged."""
     mask_labels: bool = False
     """Whether mask values are labels, of which only 0 is background."""
     offset_ms: float = 0.0
@@ -189,8 +190,8 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
     """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
-    # Content made from another format is converted to JSON and back, so that it passes the same checks as a
-    # file
+    # Readers of other formats pass Python values. Converted to JSON and back, they pass the same checks as
+    # those of a file
     as_read = read_json(json.dumps(content))
     checked = typed({"format": FORMAT, **as_read}, _Content)
     shift_px = 0.5 - np.array(checked.first_pixel_center)
@@ -210,9 +211,11 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
 
 
 def _origin_near_cameras_m(calibration: NativeCalibration) -> Float64[np.ndarray, "3"]:
-    """An origin near the cameras; 0 if that is near enough for 32-bit numbers, or they have no extent.
+    """An origin near the cameras, in the coordinates of the file.
 
-    It is their middle, rounded to a multiple of the smallest power of ten that is at least the rig's extent.
+    It is 0 if the cameras are near enough to the file's origin for 32-bit numbers, or if all are at the same
+    point. Otherwise, it is the mean of the camera centres, rounded to whole steps. A step is the rig's extent,
+    rounded up to a power of ten.
     """
     centers_m = np.array([-camera.R.T @ camera.t_m for camera in calibration.cameras])
     middle_m = centers_m.mean(0)
@@ -271,9 +274,9 @@ def _with_slashes(path: str | None) -> str | None:
 
 
 def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
-    """Write a `cameras.json` that reads back as this calibration.
+    """Write a `cameras.json` that reads back as this calibration, with lengths in metres.
 
-    Positions are in the coordinates of `calibration.file`; file paths stay unchanged.
+    Positions are relative to the origin of `calibration.file`; file paths stay unchanged.
     """
     calibration = moved_to(calibration, np.zeros(3))
     content = {
@@ -346,9 +349,8 @@ def _invalid(key: str, expected: str, got: str, next_step: str) -> ValueError:
 
 
 def stays_inside(path: str) -> bool:
-    """Whether a relative path cannot leave its folder: it is not absolute and has no drive and no `..`."""
+    """Whether a path stays inside its folder: it is relative, not empty, and has no drive and no `..`."""
     posix = PurePosixPath(path)
     windows = PureWindowsPath(path)
-    return not (
-        posix.is_absolute() or windows.drive or windows.root or ".." in windows.parts or not posix.parts
-    )
+    is_absolute = posix.is_absolute() or bool(windows.drive) or bool(windows.root)
+    return bool(posix.parts) and not is_absolute and ".." not in windows.parts

@@ -96,8 +96,8 @@ class SentMessages:
     viewers: int = 0
     """The number of viewers in the last message `stats`."""
     made_ahead: int = 0
-    """The value of `SharedState.made_ahead` when messages `completed` were last sent. While it stays the
-    same, there is nothing to announce."""
+    """The number of meshes and views that the server had completed in advance (`SharedState.made_ahead`)
+    when messages `completed` were last sent. While it stays the same, there is nothing to announce."""
     announced: dict[FrameKey, int] = field(default_factory=dict)
     """The number of meshes and completed views of each frame that a message `completed` last announced. A
     frame is announced again only when this number has changed."""
@@ -216,12 +216,12 @@ class ViewerConnection:
                 text = await self._receive()
                 if self._messages.allow():
                     self._handle(protocol.parse(text, self._registry.limits))
-                    continue
-                await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
-                limit = self._registry.limits.messages_per_s
-                self._reject(
-                    CloseCode.TOO_MANY_MESSAGES, f"expected at most {limit} messages a second; send fewer"
-                )
+                else:
+                    await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
+                    limit = self._registry.limits.messages_per_s
+                    self._reject(
+                        CloseCode.TOO_MANY_MESSAGES, f"expected at most {limit} messages a second; send fewer"
+                    )
             except ProtocolError as error:
                 self._reject(CloseCode.MALFORMED, str(error))
 
@@ -269,7 +269,8 @@ class ViewerConnection:
             case Ack():
                 self._session.ack(message.frame)
             case ClockChange():
-                self._session.change_clock(message, self._service.source.span, self._service.advance_edge())
+                live_edge = self._service.advance_edge()
+                self._session.change_clock(message, self._service.source.span, live_edge)
             case _:
                 return False
         return True
@@ -301,8 +302,8 @@ class ViewerConnection:
     def send_due(self, shared: SharedState) -> float:
         """Send the messages that are due, and end the connection if a frame was not acknowledged in time.
 
-        Returns the time, by the service's clock, at which the registry has to call this again. It
-        does so earlier if `shared` changes or the viewer sends a message.
+        Returns when the registry has to call this again, by the service's clock. The registry calls
+        it earlier if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
@@ -325,7 +326,7 @@ class ViewerConnection:
             self._sent.show = shared.show
             self._send_soon(shared.show)
 
-        # Send statistics, and news of what was made ahead.
+        # Send statistics, and announce what was completed in advance.
         self._send_statistics(shared.viewers)
         if shared.made_ahead != self._sent.made_ahead:
             self._sent.made_ahead = shared.made_ahead
@@ -334,8 +335,8 @@ class ViewerConnection:
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(CloseCode.TIMEOUT, f"expected an ack within {ACK_S:g} s; reconnect"))
 
-        # An idle viewer needs nothing until its state is repeated. All others are checked every time. A
-        # viewer that has not yet been sent the new number of viewers is not idle.
+        # An idle viewer needs nothing until its state is repeated. For all others, this is called at each check
+        # of the registry. A viewer that has not yet been sent the new number of viewers is not idle.
         gets_views = (
             session.wants_views or session.in_flight is not None or session.sent_since(now - RECENT_S)
         )
@@ -367,7 +368,7 @@ class ViewerConnection:
             self._send_soon({"type": "state"} | inputs.shared.source | viewer)
 
     def _send_made_ahead(self) -> None:
-        """Send a message `completed` for each frame whose meshes and completed views have changed."""
+        """Send a message `completed` for each frame with new meshes or views that were completed in advance."""
         counts = self._service.ahead.counts()
         for key, count in counts.items():
             if self._sent.announced.get(key) != count:
@@ -385,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # Statistics count the frames of the last second. So they change when a frame is sent, and when a frame
-        # in the last message becomes older than a second. All these frames were sent after `stats_s - 1`.
+        # Statistics count the frames that were sent in the last second. If none was sent after `stats_s - 1`,
+        # the last message counted 0 frames, and there are still none to count.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -46,7 +46,8 @@ WRITTEN_FILES = (
 WRITTEN_FOLDERS = ("not-finite-*", "tensorboard")
 """A run writes these folders."""
 LOSSES = ("inside", "outside", "total", "adversarial", "discriminator")
-"""The losses of a step are logged under these names."""
+"""The losses of a step are logged under these names. `inside` and `outside` are the L1 loss inside and outside
+the holes, `total` is the loss that is minimised, and the last two are 0 without an adversary."""
 
 
 def train(
@@ -99,8 +100,8 @@ def _claim(out: Path) -> Iterator[None]:
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN_FILES, *WRITTEN_FOLDERS)
-        # The files are recorded before they exist, and marked as changing, because a run that is killed
-        # cannot record them. The next run may then replace them
+        # The files are recorded before they exist, because a run that is killed cannot record them later. As
+        # they are marked as changing, the next run may replace them
         names = [CHECKPOINT, PREVIOUS_CHECKPOINT, *WRITTEN_FILES, *WRITTEN_FOLDERS]
         files_in_folders = [f"{pattern}/*" for pattern in WRITTEN_FOLDERS]
         folder.record(*names, *files_in_folders, changing=True)
@@ -128,9 +129,10 @@ class Processes:
         return Ddp(module, device_ids=devices, find_unused_parameters=True)
 
     def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
-        """The positions of the streams of all processes, by number, given those of this process.
+        """The positions of the sample streams of all processes, given those of this process.
 
-        A stream of samples can be resumed at its position. Stream n belongs to process n % count.
+        A stream can be resumed at its position. The result is ordered by the number of the stream: stream n
+        belongs to process n % `count`.
         """
         own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
         if self.count == 1:
@@ -138,6 +140,7 @@ class Processes:
         else:
             gathered = [torch.empty_like(own) for _ in range(self.count)]
             torch.distributed.all_gather(gathered, own)
+        # Stacked, the axes are: stream of its process, process, field. So flattening orders streams by number
         by_number = torch.stack(gathered, 1).flatten(0, 1)
         return tuple(ReplayPosition(*position) for position in by_number.tolist())
 
@@ -334,20 +337,16 @@ class Run:
                 self._save(step, clock)
             elif self.processes.is_first and not self.keeps_best:
                 self._write_model()  # the run was complete already, but its model may have been removed
-            # Validate the last steps, unless the loop has just done so. They were saved first, because validation
-            # takes long. If their weights are the best, save again, because a checkpoint holds the best score.
-            if step > first_step and config.validate_every and step % config.validate_every:
-                if self.validation is not None:
-                    self._validate(log, step)
-                has_better_weights = float(self.keeps_best and self.state.best_step == step)
-                (any_has_better_weights,) = self.processes.maximum(has_better_weights)
-                if any_has_better_weights:
-                    self._save(step, clock)
+
+            # The last steps have just been saved. Only then are they validated, because that takes long
+            if config.validate_every and step > first_step and step % config.validate_every != 0:
+                self._validate_last_steps(log, step, clock)
 
     def _make_validation(self) -> Validation | None:
-        """What scores the model: the held-back views of captures if the run keeps the best weights.
+        """The function that scores the model; None in processes that do not validate.
 
-        None if nothing is scored in this process.
+        A run that keeps the best weights is scored on views that its captures hold back, all others as their
+        objective says.
         """
         if not self.config.validate_every or not self.processes.is_first:
             return None
@@ -362,7 +361,7 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Score and log the averaged weights; write them if they are the best so far, and the run keeps those."""
+        """Score and log the averaged weights. If the run keeps the best weights, and these are, write them."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first_scores = log.first_validation() or scores
@@ -375,6 +374,18 @@ class Run:
         if self.keeps_best and score is not None and is_better(score, best):
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(step)
+
+    def _validate_last_steps(self, log: Log, step: int, clock: RunClock) -> None:
+        """Validate the last weights; if they are the best, save again, because a checkpoint holds the best score.
+
+        Every process calls this: only the first validates, but all take part in saving.
+        """
+        if self.validation is not None:
+            self._validate(log, step)
+        has_better_weights = float(self.keeps_best and self.state.best_step == step)
+        (any_has_better_weights,) = self.processes.maximum(has_better_weights)
+        if any_has_better_weights:
+            self._save(step, clock)
 
     def _checkpoint_due(self, step: int, clock: RunClock) -> bool:
         """Whether to write a checkpoint: `checkpoint_minutes` after the last one, or after better weights.
@@ -395,16 +406,16 @@ class Run:
         """Update all weights once, by the mean gradient over the samples of all streams."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = []
-        done = 0
-        count = sum(map(len, batches))
+        num_done = 0
+        num_samples = sum(map(len, batches))
         for number, batch in enumerate(batches):
             stream = number * self.processes.count + self.processes.rank
             torch.manual_seed(step_seed(self.config.seed, step, stream))
             for piece in self._split(batch):
-                share = len(piece) / count
-                done += len(piece)
+                share = len(piece) / num_samples
+                num_done += len(piece)
                 # Gradients accumulate; only the last backward pass averages them over the processes.
-                is_last = done == count
+                is_last = num_done == num_samples
                 with nullcontext() if is_last else self._without_sync():
                     samples = [to_device(sample, self.processes.device) for sample in piece]
                     terms = self._add_gradients(step, samples, share)
@@ -423,19 +434,19 @@ class Run:
         return self.ddp_objective.no_sync() if isinstance(self.ddp_objective, Ddp) else nullcontext()
 
     def _split(self, batch: list[object]) -> list[list[object]]:
-        """Parts of a batch of at most `microbatch` samples."""
+        """The batch in parts of at most `microbatch` samples."""
         size = self.config.microbatch or len(batch)
         return [batch[first : first + size] for first in range(0, len(batch), size)]
 
     def _add_gradients(self, step: int, samples: list[object], share: float) -> dict[str, float]:
-        """Add `share` times the gradients of these samples' loss; returns its terms, named as `LOSSES`."""
+        """Add the gradients of these samples' loss, multiplied by `share`; returns the `LOSSES` by name."""
         output = self.ddp_objective(samples)
         assert isinstance(output, StepOutput)
         total = output.total
         adversarial = 0.0
         discriminator = 0.0
         if self.adversary is not None:
-            assert output.judged is not None, "objectives with an adversary return what it judges"
+            assert output.judged is not None, "objectives with an adversary return its discriminator's input"
             term, discriminator = self.adversary.losses(output.judged, share)
             total = total + self.adversary.weight * term
             adversarial = float(term.detach())
@@ -466,22 +477,22 @@ class Run:
         )
 
     def _make_streams(self) -> list[SampleReplay[object]]:
-        """The streams of this process: numbers rank, rank + count and so on."""
+        """The sample streams of this process: every n-th of all streams, for n processes."""
         config = self.config
         processes = self.processes
-        count = max(config.streams, processes.count)
-        if count % processes.count:
+        num_streams = max(config.streams, processes.count)
+        if num_streams % processes.count:
             raise ValueError(
-                f"expected the same number of streams for each process, got {count} for {processes.count}; "
-                "change either"
+                "expected the same number of streams for each process, "
+                f"got {num_streams} for {processes.count}; change either"
             )
-        if self.state.positions and len(self.state.positions) != count:
+        if self.state.positions and len(self.state.positions) != num_streams:
             raise ValueError(
                 f"expected the {len(self.state.positions)} streams of the earlier part of the run, "
-                f"got {count}; start the same number of processes again"
+                f"got {num_streams}; start the same number of processes again"
             )
         streams = []
-        for number in range(processes.rank, count, processes.count):
+        for number in range(processes.rank, num_streams, processes.count):
             seed = f"{config.seed}/{number}"
             position = self.state.positions[number] if self.state.positions else None
             scenes = self.objective.training_scenes(seed)

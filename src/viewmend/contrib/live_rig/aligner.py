@@ -13,17 +13,19 @@ from dataclasses import dataclass, field
 from viewmend.data.camera_images import CameraImages
 
 ABSENT_S = 0.5
-"""A group does not wait for cameras that were silent for this many seconds, and for `ABSENT_TICKS`."""
+"""Groups do not wait for a camera that was silent for more than this many seconds, or for more than
+`ABSENT_TICKS` if that is longer."""
 ABSENT_TICKS = 1.5
-"""A camera of a slow rig that sends an image for each tick is silent for up to this many ticks."""
+"""A camera that sends one image per tick is never silent for more than this many ticks. At low frame rates,
+that is longer than `ABSENT_S`."""
 PHASE_GAIN = 0.05
-"""The ticks follow the cameras: each group moves later ticks by this fraction of the median offset of its
-images from their tick."""
+"""Ticks follow the exposures of the cameras: after each group, all later ticks are moved by the median offset
+of the group's images from their tick, times this factor."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""This many groups may wait to be taken, in addition to those that may still wait for images. If there are more,
-the oldest are dropped."""
+"""No more than this many groups are kept, plus one for each tick within the time that a group waits for images. If
+there are more, because they are not taken, the oldest are dropped."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class ImageGroup:
     """The cameras' images of one tick."""
 
     since_s: float
-    """When the first of them arrived."""
+    """When the first of these images arrived."""
     by_camera: dict[str, TimedImages] = field(default_factory=dict)
 
     @property
@@ -62,7 +64,7 @@ class Aligner:
     """Groups images by tick. One thread at a time may call it.
 
     A group is complete when each camera has sent an image for the group's tick or a later tick. Cameras that
-    have been silent for `ABSENT_S` and `ABSENT_TICKS` are not waited for.
+    have been silent for the longer of `ABSENT_S` and `ABSENT_TICKS` are not waited for.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:

@@ -71,7 +71,7 @@ class Timing(NamedTuple):
     """How one recording is played on the timeline."""
 
     lap_s: float
-    """See `Playback.length_s`."""
+    """Length of a lap (`Playback.length_s`)."""
     shift_s: float
     """Seconds to add to the recording's times, which gives times on the timeline."""
 
@@ -82,7 +82,8 @@ class Playback:
     def __init__(self, length_s: float = 1.0) -> None:
         self.start_s = time.monotonic()
         self.length_s = length_s
-        """The length of a lap. When the first recording ends, all of them start again."""
+        """The length of a lap, that is, one pass through the recordings: as soon as one of them ends, all start
+        again."""
         self.shifts_s: dict[str, float] = {}
         """Seconds to add to the times of each recording, which gives times on the timeline. The timeline starts
         at the earliest image of all recordings. A recording without a shift here starts at 0."""
@@ -100,10 +101,11 @@ class Playback:
         first_s = min(float(track.times_s[0]) for track in matched)
         ends_s = [float(track.times_s[-1]) + 1 / (track.fps or 1.0) for track in matched]
         self.length_s = min(ends_s) - first_s
-        self.shifts_s = {}
+        shifts_s: dict[str, float] = {}
         for original, shifted in zip(tracks, matched, strict=True):
             shift_s = float(shifted.times_s[0] - original.times_s[0])
-            self.shifts_s[original.camera] = shift_s - first_s
+            shifts_s[original.camera] = shift_s - first_s
+        self.shifts_s = shifts_s  # only now, because readers on other threads must not find a part of it
         return clock.timecode_note
 
     def timing(self, name: str, first_s: float) -> Timing:
@@ -157,10 +159,10 @@ def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[Dec
             except av.InvalidDataError:
                 damage.note_damaged(arrived_s)
                 continue
+            is_damaged = packet.is_corrupt
             for frame in frames:
-                if not damage.accepts(frame, packet.is_corrupt, arrived_s) or not times.is_new(frame, counts):
-                    continue
-                taken_s = times.taken_s(frame, arrived_s)
+                is_usable = damage.accepts(frame, is_damaged, arrived_s) and times.is_new(frame, counts)
+                taken_s = times.taken_s(frame, arrived_s) if is_usable else None
                 if taken_s is not None:
                     first_field = first_field_of(stream.codec_context)
                     yield DecodedImage(frame, taken_s - camera.offset_s, first_field)
@@ -248,7 +250,7 @@ class DamageFilter:
     def __init__(self, counts: "Counter[str]") -> None:
         self._counts = counts
         self._has_begun = False
-        """Whether an image was accepted."""
+        """Whether an image was accepted since the stream was opened."""
         self._damaged_s: float | None = None
         """When the last damaged image arrived; None after an image was accepted."""
 
@@ -270,6 +272,6 @@ class DamageFilter:
         return True
 
     def _count_rejected(self) -> None:
-        """Count a rejected image, unless none was accepted yet: a stream that is joined midway starts with damage."""
+        """Count a rejected image, if one was accepted before: a stream that is joined midway starts with damage."""
         if self._has_begun:
             self._counts["torn"] += 1

@@ -44,7 +44,8 @@ class ImageTimes:
         """Whether the image's timestamp differs from the previous one; counts a "duplicated" image if not."""
         is_repeated = frame.pts is not None and frame.pts == self._last_pts
         self._last_pts = frame.pts
-        counts["duplicated"] += is_repeated
+        if is_repeated:
+            counts["duplicated"] += 1
         return not is_repeated
 
 
@@ -57,8 +58,9 @@ class SenderTimes(ImageTimes):
         self._clock = SenderClock()
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last `lag_packets + 1` packets; None for those it did not wait for. The
-        newest packet's data arrived at the first of these times: FFmpeg held it for `lag_packets` more."""
+        """When the reader received the last `lag_packets + 1` packets, the oldest first; None for those it did not
+        wait for. As FFmpeg returns packets late, the data of the newest packet arrived when the reader
+        received the oldest of these."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

@@ -118,7 +118,7 @@ class LiveRig:
     cameras: tuple[LiveCamera, ...]
     fps: float
     tolerance_s: float
-    """Largest difference between the times of an image and its frame."""
+    """Largest difference between the time of an image and the time of the frame that uses it."""
     wait_s: float
     """How long a frame waits for late images."""
     up: Float64[np.ndarray, "3"] | None
@@ -174,7 +174,7 @@ def read_rig(path: Path, max_image_size: int | None = None, fps: float | None = 
 
 
 def _calibration(path: Path, format: str | None) -> NativeCalibration:
-    """The calibration in a folder of any format, in a file of such a folder, or in a file that stands for a capture.
+    """Read the calibration that a rig names: a folder of any format, one of its files, or a file of a whole capture.
 
     Raises:
         CaptureError: there is none, or the calibration recognised in the folder is another file.
@@ -182,8 +182,8 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file() or is_capture_file(path, format):
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # A calibration may consist of several files. A file with the suffix of the recognised one may also be another
-    # calibration, so it is refused unless the format is given.
+    # A calibration may consist of several files, of which the rig may name any. But a file with the suffix of
+    # the one that was read may be a different calibration, so it is refused unless the format is given.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(
@@ -217,7 +217,10 @@ def _camera(
 
 
 def _reduced(camera: NativeCamera, max_image_size: int | None) -> NativeCamera:
-    """The calibration for images reduced to at most this length; distortion coefficients do not change."""
+    """The calibration for images whose longer side is reduced to at most this many pixels.
+
+    Distortion coefficients do not depend on the size.
+    """
     longest = max(camera.width, camera.height)
     if max_image_size is None or longest <= max_image_size:
         return camera

@@ -133,8 +133,8 @@ class RigFileSource(LiveSource):
         Raises:
             CaptureError: a clean plate or a recording cannot be used. The current rig stays as it is.
         """
-        # Workers of unchanged cameras are kept. Cameras hold arrays, for which == gives no single truth
-        # value, so their representations are compared.
+        # Workers of unchanged cameras are kept. Cameras are compared as text, because they hold arrays, for which
+        # == gives one truth value per entry.
         unchanged = {repr(camera) for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._make_worker(camera) for camera in rig.cameras if camera.name not in kept}
@@ -239,8 +239,8 @@ class RigFileSource(LiveSource):
     def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
         """Check, align and colour-match the rig by its first frame; None if fewer than two masks have a subject."""
         assert frame.mask is not None, "live cameras are masked"
-        num_subjects = (frame.mask.amax((1, 2)) > FOREGROUND).sum()
-        if int(num_subjects) < 2:
+        shows_subject = frame.mask.amax((1, 2)) > FOREGROUND  # one value per camera
+        if int(shows_subject.sum()) < 2:
             return None
         assert self.rig is not None, "the rig has begun"
         capture = MemoryCapture(

@@ -40,7 +40,8 @@ def reduce_image(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
     """An image reduced to this width and height; unchanged if it already has this size."""
     import cv2
 
-    if rgb.shape[1::-1] == size_px:
+    height, width = rgb.shape[:2]
+    if (width, height) == size_px:
         return rgb
     return np.asarray(cv2.resize(rgb, size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
@@ -99,7 +100,8 @@ class CameraWorker:
         self.up = False
         """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why no images are delivered, or the last fault of an image since connecting; None if neither."""
+        """Why the camera delivers no images or, while it does, why an image was last refused. None if there was
+        no fault since connecting."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
         colour = camera.calibration.colour
@@ -108,7 +110,7 @@ class CameraWorker:
         self._deliver = deliver
         self._wants = wants
         self._up_changed_s = time.monotonic()
-        """When `up` last changed."""
+        """When `up` last changed, on this machine's monotonic clock, as all times of this class."""
         self._last_taken_s: float | None = None
         """When the last image was taken; None before the first."""
         self._period_s = 0.0
@@ -127,7 +129,7 @@ class CameraWorker:
             thread.start()
 
     def ask_to_stop(self) -> None:
-        """Let the threads end, without waiting for them."""
+        """Ask both threads to end, without waiting for them."""
         self._stopped.set()
 
     def stop(self) -> None:

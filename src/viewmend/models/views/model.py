@@ -13,6 +13,7 @@ colours, of the most trusted camera and of the rendered view, each times a gain 
 predicts for every pixel.
 """
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -72,7 +73,8 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_SAMPLES = tuple(OFFSETS.index(offset) for offset in (0.0, 0.053, 0.19))
-"""The cameras of a ray are chosen by how well they see these of its samples."""
+"""Indices of the samples by which the cameras of a ray are chosen: those that see these samples best. The
+samples are on the proxy, and 0.053 and 0.19 subject sizes behind it (`OFFSETS`)."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """The U-Net gets this many channels of a cell, apart from its ray samples: those of `ViewImage`, the depth
 of the proxy relative to the subject's median depth, and whether the proxy or its rim covers the cell."""
@@ -88,8 +90,6 @@ PIXEL_CHANNELS = 27
 of the pixel's sample."""
 OUTPUT_CHANNELS = (NUM_CANDIDATES, 1, 1, NUM_GAINS)
 """The last convolutions return scores of the candidate colours, alpha, confidence, and gains of detail."""
-DETAILED = slice(1, NUM_CANDIDATES, 2)
-"""The candidate colours `single` and `rendered`, whose detail is added to the blended colours, too."""
 ALPHA_SLOPE = 4.0
 """The cameras' mean mask, minus 0.5, is multiplied by this factor and added to the logit of alpha."""
 MIN_DETAIL_WEIGHT = 0.01
@@ -137,8 +137,28 @@ class CandidateColours(NamedTuple):
 
     @classmethod
     def unstack(cls, stacked: Float[Tensor, "pixel 4 3"]) -> "CandidateColours":
-        """The fields as views of stacked colours, which the network scores in this order."""
+        """The fields, from all candidates in one tensor. The network scores them in the order of the fields."""
         return cls(*stacked.unbind(1))
+
+
+class CellInputs(NamedTuple):
+    """The inputs of the depth distribution."""
+
+    view: IncompleteView
+    """The rendered view, with depth on the rim, too."""
+    predicted: Mask
+    """Its pixels to predict."""
+    image: ViewImage
+    """Its channels as inputs of the network."""
+
+
+class CellDepth(NamedTuple):
+    """The nearest z-depth in each cell, metres; 0 in cells without depth."""
+
+    predicted: Float[Tensor, "rows columns"]
+    """The nearest among the pixels to predict."""
+    all_pixels: Float[Tensor, "rows columns"]
+    """The nearest among all pixels of the proxy and its rim."""
 
 
 class ViewSynthNet(Network):
@@ -150,7 +170,7 @@ class ViewSynthNet(Network):
     config: ViewsConfig
     trained_in_bfloat16 = True
     error_rule = "all"
-    """The whole subject is predicted: the model learned to keep the pixels that are already correct."""
+    """The default error mask selects the whole subject: the model learned to keep pixels that are already correct."""
     predicts_depth = True
 
     def __init__(self, config: ViewsConfig | None = None) -> None:
@@ -200,16 +220,16 @@ class ViewSynthNet(Network):
         filled: Image | None = None,
         allow_large_cells: bool = False,
     ) -> ViewPrediction:
-        """Predicts pixels of a view. `where` selects them; the view's error mask E is ignored.
+        """Predicts the pixels of a view that `where` selects. `step` derives it from the error mask E.
 
         Args:
             view: the rendered view, or a crop of it.
             sources: the cameras to sample.
-            scale: the scale of the whole view, if `view` is a crop.
+            scale: size and depth of the subject in the whole view, if `view` is a crop; computed if None.
             where: pixels outside this mask are not predicted; None predicts the whole proxy and its rim.
             filled: the result of `fill_holes` for the whole view, cropped as `view` is; computed if None.
-            allow_large_cells: whether a magnified view gets larger cells (`LARGE_CELLS_FROM`).
-                Training and exported models do not use them.
+            allow_large_cells: whether cells are larger in a view that magnifies the cameras' images
+                (`LARGE_CELLS_FROM`). Training and exported models do not use them.
         """
         if scale is None:
             scale = SceneScale.of(view)
@@ -220,13 +240,13 @@ class ViewSynthNet(Network):
         predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
 
-        # The depth distribution, in cells of `CELL_PX` pixels of the view or, for large cells, of half the view
+        # The depth distribution, in cells of `CELL_PX` pixels. Large cells are cells of the view at half its size
         large_cells = allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM
-        cell_inputs = halve(with_rim, predicted, image) if large_cells else (with_rim, predicted, image)
-        cell_view, cell_predicted, cell_image = cell_inputs
-        cell_depth = depth_of_cells(cell_view, cell_predicted)
-        pixels, cells = nonzero_of(predicted, cell_depth[0] > 0)
-        distribution = self._depth_distribution(cell_view, cell_image, sources, scale, cells, cell_depth)
+        full_size = CellInputs(with_rim, predicted, image)
+        inputs = halve(full_size) if large_cells else full_size
+        cell_depth = depth_of_cells(inputs.view, inputs.predicted)
+        pixels, cells = nonzero_of(predicted, cell_depth.predicted > 0)
+        distribution = self._depth_distribution(inputs.view, inputs.image, sources, scale, cells, cell_depth)
         if large_cells:
             distribution = distribution._replace(cell_px=2 * CELL_PX)
         return self._blend(with_rim, sources, scale, pixels, image, distribution)
@@ -242,7 +262,7 @@ class ViewSynthNet(Network):
         """The image of the whole view, with holes filled coarsely.
 
         `RayFill` fills them from the cameras. If `quick`, or if the model has no `RayFill`, they are
-        filled from the pixels around them. `scale` is the view's, if it is known.
+        filled from the pixels around them. `scale` is that of the view; it is computed if None.
         """
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
@@ -255,7 +275,7 @@ class ViewSynthNet(Network):
     @torch.no_grad()
     @one_thread()
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
-        """The predicted errors of a rendered view; None without an `ErrorPredictor` or cameras."""
+        """The predicted errors of a rendered view; None if the model has no `ErrorPredictor` or no camera is used."""
         if self.errors is None:
             return None
         sources = SourceCameras.closest_to(view, context, self.config.num_views)
@@ -276,10 +296,10 @@ class ViewSynthNet(Network):
         predicted = with_rim.depth > 0
         image = ViewImage.of(view, filled, predicted)
         cell_depth = depth_of_cells(with_rim, predicted)
-        pixels, cells = nonzero_of(predicted, cell_depth[0] > 0)
+        pixels, cells = nonzero_of(predicted, cell_depth.predicted > 0)
         distribution = self._depth_distribution(with_rim, image, sources, scale, cells, cell_depth)
-        shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
-        surface = surface_points(with_rim.depth, scale, pixels, distribution, shares)
+        probability = distribution.interpolate(distribution.logits.softmax(1), pixels)
+        surface = surface_points(with_rim.depth, scale, pixels, distribution, probability)
         found = torch.stack([surface.depth, surface.probability], 1)
         depth, confidence = scatter_to_image(found, pixels, view.mask.shape)
         return DepthMap(depth, confidence)
@@ -297,7 +317,7 @@ class ViewSynthNet(Network):
     def step(
         self, view: IncompleteView, context: ContextProvider, state: State
     ) -> tuple[CompletedView, State]:
-        """Predicts the pixels with E > 0 on the proxy and its rim.
+        """Predicts the pixels of the proxy and its rim that the error mask selects (E > 0).
 
         Pixels that `view.fade` marks as background are not predicted but attenuated. With a
         `RenderQuality.refine_fraction` of 0 nothing is predicted: holes are filled from their
@@ -342,25 +362,25 @@ class ViewSynthNet(Network):
         sources: SourceCameras,
         scale: SceneScale,
         cells: Pixels,
-        cell_depth: Float[Tensor, "2 rows columns"],
+        cell_depth: CellDepth,
     ) -> DepthDistribution:
-        """Samples the cameras on the rays of cells with a pixel to predict, and scores the samples by a U-Net.
+        """Samples the cameras on the rays of `cells`, those with a pixel to predict, and scores the samples.
 
         `view` has depth on the rim, too; `cell_depth` is its `depth_of_cells`.
         """
         # The depth hypotheses of the cells' rays
-        proxy_depth, whole_depth = cell_depth
         rows, columns = cells.unbind(1)
-        z_m = scale.depths_behind(proxy_depth[rows, columns], OFFSETS)
+        z_m = scale.depths_behind(cell_depth.predicted[rows, columns], OFFSETS)
         rays = Rays(view, scale, cells, z_m, cell_px=CELL_PX)
 
-        # Further inputs of the U-Net, in all cells: the rendered view, and all depth of the proxy and its rim
-        has_depth = whole_depth > 0
-        relative = ((whole_depth - scale.depth_m) / scale.size_m).tanh() * has_depth
+        # Further inputs of the U-Net: the rendered view and the depth, also in cells without a pixel to predict
+        depth = cell_depth.all_pixels
+        has_depth = depth > 0
+        relative = ((depth - scale.depth_m) / scale.size_m).tanh() * has_depth
         means = cell_means(image.stacked())
         cell_channels = concatenate_channels(means, relative[None], has_depth[None].to(means))
 
-        # Score of each hypothesis: that of its sample alone, plus that of its neighbourhood
+        # A hypothesis has two scores, which are summed: one from its sample alone, one from the U-Net
         with self.autocast():
             samples, cameras = self._aggregate(rays, sources)
             inputs = samples.features.flatten(1).to(self.compute_dtype)
@@ -368,8 +388,8 @@ class ViewSynthNet(Network):
             with all_threads():
                 features = self.unet.forward_points(inputs, cells, cell_channels.to(inputs))
             logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
-        cell_index = index_image(cells, proxy_depth.shape)
-        return DepthDistribution(cells, cell_index, proxy_depth, logits, samples, cameras, features)
+        cell_index = index_image(cells, depth.shape)
+        return DepthDistribution(cells, cell_index, cell_depth.predicted, logits, samples, cameras, features)
 
     def _aggregate(
         self, rays: Rays, sources: SourceCameras
@@ -384,8 +404,10 @@ class ViewSynthNet(Network):
             parts.append(self.sample_aggregator(samples))
             cameras.append(samples.cameras)
         # pyrefly: ignore[bad-argument-type]
-        chosen = cameras[0] if len(cameras) == 1 or cameras[0] is None else torch.cat(cameras)
-        return AggregatedSamples.cat(parts), chosen
+        aggregated = AggregatedSamples.cat(parts)
+        if len(cameras) == 1 or cameras[0] is None:  # None: all rays are sampled in all cameras
+            return aggregated, cameras[0]
+        return aggregated, torch.cat(cameras)
 
     def _blend(
         self,
@@ -417,9 +439,11 @@ class ViewSynthNet(Network):
         out = self._blending_layers(inputs, pixels, view.mask.shape, features_at_cells(distribution, view))
         scores, alpha_logit, confidence_logit, gains = out.split(OUTPUT_CHANNELS, 1)
 
-        # Blend the colours, then add detail
+        # Blend the colours: per pixel, (1, 4) weights @ (4, 3) colours
         blended = (scores.softmax(1)[:, None] @ candidates)[:, 0]
-        detail_sources = torch.cat([blended[:, None], candidates[:, DETAILED]], 1)
+
+        # Add detail
+        detail_sources = sources_of_detail(blended, candidates)
         magnification = sources.magnification(view.camera, scale)
         detail = amplify_detail(detail_sources, mask, gains, pixels, view.mask.shape, magnification)
 
@@ -451,7 +475,7 @@ class ViewSynthNet(Network):
         shape: torch.Size,
         features: Float[Tensor, "1 feature rows columns"],
     ) -> Float[Tensor, "pixel output"]:
-        """The last convolutions, at these pixels of an image of this shape."""
+        """Applies the last convolutions to an image of this height and width; returns their output at `pixels`."""
         with self.autocast(), all_threads():
             # Inference on a CPU leaves out the parts of the image that contain none of the pixels
             if inputs.device.type == "cpu" and not torch.is_grad_enabled():
@@ -465,22 +489,17 @@ class ViewSynthNet(Network):
         return out[0, :, rows, columns].T.float()
 
 
-def depth_of_cells(view: IncompleteView, predicted: Mask) -> Float[Tensor, "2 rows columns"]:
-    """The nearest depth in each cell, metres: of the pixels to predict, and of all; 0 where none has one."""
-    return nearest_depth(torch.stack([view.depth * predicted, view.depth]))
+def depth_of_cells(view: IncompleteView, predicted: Mask) -> CellDepth:
+    """The depth of each cell of a view, given its pixels to predict."""
+    return CellDepth(*nearest_depth(torch.stack([view.depth * predicted, view.depth])))
 
 
-def halve(
-    view: IncompleteView, predicted: Mask, image: ViewImage
-) -> tuple[IncompleteView, Bool[Tensor, "rows columns"], ViewImage]:
-    """The view at half its resolution, its pixels to predict, and its `ViewImage`.
-
-    One of its cells covers 4 x 4 pixels of the full resolution.
-    """
-    half_predicted = nearest_depth(view.depth * predicted) > 0
-    filled = downsample2x(replace(view, rgb=image.filled)).rgb
-    half_view = downsample2x(view)
-    return half_view, half_predicted, ViewImage.of(half_view, filled, half_predicted)
+def halve(inputs: CellInputs) -> CellInputs:
+    """The inputs at half the resolution. One of their cells covers 4 x 4 pixels of the full resolution."""
+    predicted = nearest_depth(inputs.view.depth * inputs.predicted) > 0
+    filled = downsample2x(replace(inputs.view, rgb=inputs.image.filled)).rgb
+    view = downsample2x(inputs.view)
+    return CellInputs(view, predicted, ViewImage.of(view, filled, predicted))
 
 
 def surface_rays(
@@ -503,8 +522,16 @@ def features_at_cells(
     if factor == 1:
         return distribution.features
     fine = F.interpolate(distribution.features, scale_factor=factor, mode="bilinear", align_corners=False)
-    rows, columns = (-(-length // CELL_PX) for length in view.mask.shape)
+    rows, columns = (math.ceil(length / CELL_PX) for length in view.mask.shape)
     return fine[:, :, :rows, :columns]
+
+
+def sources_of_detail(
+    blended: Float[Tensor, "pixel 3"], candidates: Float[Tensor, "pixel 4 3"]
+) -> Float[Tensor, "pixel 3 3"]:
+    """The colours whose detail is added: blended, of the most trusted camera, and of the rendered view."""
+    colours = CandidateColours.unstack(candidates)
+    return torch.stack([blended, colours.single, colours.rendered], 1)
 
 
 def amplify_detail(
@@ -528,6 +555,8 @@ def amplify_detail(
         magnification: that of the images (`SourceCameras.magnification`).
     """
     bands = detail_bands(colours, mask.clamp_min(MIN_DETAIL_WEIGHT), pixels, shape, magnification)
+
+    # The axes band and image become one, in the order of the gains: per pixel, (1, gain) @ (gain, 3)
     return (gains[:, None] @ bands.flatten(1, 2))[:, 0]
 
 
@@ -572,7 +601,7 @@ def pixel_inputs(
         candidates: the candidate colours, stacked.
         mask: the cameras' mean mask on the surface.
         soft_mask: the mean mask over the depth hypotheses.
-        statistics: those of the sample on the surface.
+        statistics: how the cameras' colours and masks differ at the sample on the surface.
         surface: the points that the pixels show.
         image: the rendered view.
         pixels: row and column of each pixel.
