@@ -153,6 +153,19 @@ def test_images_without_suffix_may_have_any(tmp_path):
         open_capture(tmp_path)
 
 
+def test_the_size_of_a_large_tiff_is_at_its_end(tmp_path, rng):
+    rig = random_rig(3, 2)
+    write_toml(tmp_path / "Calib.toml", opencv([camera | {"width": 700, "height": 600} for camera in rig]))
+    for camera in rig:
+        (tmp_path / "images" / camera["name"]).mkdir(parents=True)
+        picture = torch.randint(0, 256, (600, 700, 3), generator=rng).byte().numpy()
+        cv2.imwrite(str(tmp_path / "images" / camera["name"] / "000.tif"), picture)
+    assert open_capture(tmp_path).cameras.size_px.tolist() == [[700, 600]] * len(rig)
+    (tmp_path / "images" / rig[0]["name"] / "000.tif").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"000\.tif' .* got a file that is no image or is damaged; copy"):
+        open_capture(tmp_path)
+
+
 # COLMAP's models.
 
 

@@ -25,7 +25,7 @@ from viewmend.data.videos import is_video, video_properties
 
 Item = TypeVar("Item")
 HEADER_BYTES = 2**20
-"""How much of an image is read to find its size."""
+"""How much of an image is read to find its size, unless it is farther back."""
 PLACES = ("videos", "synchronized_videos", "videos-raw", "recordings", "images", "")
 """Folders that are searched for footage; in `recordings` also its only subfolder."""
 MASK_PLACES = ("masks", "mask", "mask_cihp", "schp", "fmask", "rvm", "bgmtv2")
@@ -95,17 +95,20 @@ def warn(text: str) -> None:
 def image_size_px(folder: Path, name: str) -> tuple[int, int]:
     """Width and height of an image in the folder, from its header; ValueError without one inside the folder."""
     size = None
+    got = "none; add the file"
     if stays_inside(name):
         with suppress(OSError):
             path = folder / stored_path(folder, name)
             header = read_bytes(path, HEADER_BYTES)
+            got = "a file that is no image or is damaged; copy or export it again"
             if is_heif(header) and pillow_heif is None:
                 raise ValueError(f"{name[:200]!r}: {HEIF_REFUSED}")
-            size = heif_size_px(read_bytes(path)) if is_heif(header) else size_from_header(header)
+            size = None if is_heif(header) else size_from_header(header)
+            if size is None:  # the header of a TIFF may be at its end
+                content = read_bytes(path)
+                size = heif_size_px(content) if is_heif(content) else size_from_header(content)
     if size is None:
-        raise ValueError(
-            f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file"
-        )
+        raise ValueError(f"expected an image {name[:200]!r} in the folder to find the size, got {got}")
     return size
 
 
