@@ -1,7 +1,9 @@
 """Written captures, in our own format read back the same; folders are complete or absent."""
 
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,8 @@ import torch
 
 from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
-from viewmend.data.native_writer import write_capture
-from viewmend.data.source import CaptureWrapper
+from viewmend.data.native_writer import atomic_folder, write_capture
+from viewmend.data.source import CaptureSubset, CaptureWrapper
 
 
 class Changed(CaptureWrapper):
@@ -90,6 +92,49 @@ def test_folders_in_use_are_not_changed(plain, tmp_path):
     (out / "thesis.txt").unlink()
     write_capture(open_capture(plain.path), out)
     assert open_capture(out).frame_ids == ("000", "001")
+
+
+@pytest.mark.parametrize("kind", ["link", "working folder"])
+def test_an_existing_folder_is_filled_and_not_replaced(tmp_path, monkeypatch, kind):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    out = {"link": tmp_path / "link", "working folder": Path()}[kind]
+    if kind == "link":
+        out.symlink_to(folder)
+    monkeypatch.chdir(folder)
+    number = folder.stat().st_ino
+    (folder / f".{out.absolute().name}.unfinished-{os.getpid()}").mkdir()  # left by a process of the same id
+    with atomic_folder(out) as unfinished:
+        unfinished.mkdir()
+        for name in ("cameras.json", "image"):
+            (unfinished / name).write_text(name)
+        assert not (folder / "image").exists()
+    assert sorted(path.name for path in folder.iterdir()) == ["cameras.json", "image"]
+    assert folder.stat().st_ino == number and len(list(tmp_path.iterdir())) == 1 + (kind == "link")
+
+
+def test_a_link_to_nothing_is_refused_at_once(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    with (
+        pytest.raises(CaptureError, match="expected a new or empty folder"),
+        atomic_folder(tmp_path / "link"),
+    ):
+        raise AssertionError("the work has begun")
+
+
+def test_leftovers_of_a_process_with_the_same_id_are_removed(tmp_path):
+    (tmp_path / f".copy.unfinished-{os.getpid()}").mkdir()
+    with atomic_folder(tmp_path / "copy") as unfinished:
+        unfinished.mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+def test_cameras_that_are_absent_from_all_written_frames_are_left_out(plain, tmp_path, caplog):
+    plain.edit(lambda d: [camera.pop("mask") for camera in d["cameras"]])
+    (plain.path / "images/d_000.png").unlink()
+    write_capture(CaptureSubset(open_capture(plain.path), range(1)), tmp_path / "copy")
+    assert open_capture(tmp_path / "copy").cameras.names == ("a", "b", "c")
+    assert "cameras without an image in these frames are left out: d" in caplog.text
 
 
 def test_failures_leave_nothing_behind(plain, tmp_path):

@@ -122,7 +122,7 @@ def _describe_notes(masked: "MaskedCapture") -> list[str]:
 
 def _check(options: Options) -> None:
     """Raise ValueError if options contradict each other."""
-    from viewmend.data.errors import CaptureError
+    from viewmend.data.native_writer import check_new_folder
 
     plates = (options.plate is not None) + (options.plate_frames is not None)
     if (options.method == "plate" and plates != 1) or plates > 1:
@@ -135,10 +135,7 @@ def _check(options: Options) -> None:
         )
     if (options.method == "onnx") != (options.network is not None):
         raise ValueError("expected --network with --method onnx and with no other; give both or neither")
-    if options.out.exists() and not (options.out.is_dir() and not any(options.out.iterdir())):
-        raise CaptureError(
-            f"{options.out}: expected a new or empty folder, got one with files; choose another"
-        )
+    check_new_folder(options.out)
 
 
 def _masked(options: Options, capture: "CaptureFolder", part) -> "MaskedCapture":

@@ -1,5 +1,6 @@
 """Writing any source of frames as a capture folder in our own format."""
 
+import logging
 import os
 import re
 import shutil
@@ -43,8 +44,9 @@ def write_capture(
 
     With PNG, reading the folder returns the same frames bit for bit (depth to half a
     millimetre). JPEG (quality 95, no chroma subsampling) is smaller; masks and depth are
-    always PNG. The folder is complete or absent, see `atomic_folder`. Returns the indices
-    of frames with masks but without a subject.
+    always PNG. The folder is complete or absent, see `atomic_folder`. Cameras that are absent
+    from all frames are left out, with a warning. Returns the indices of frames with masks but
+    without a subject.
 
     Args:
         source: a capture, a studio, or any other `CaptureSource`.
@@ -75,35 +77,49 @@ def write_capture(
 
 @contextmanager
 def atomic_folder(out: Path | str) -> Iterator[Path]:
-    """Yield the path of a temporary folder. The caller creates and fills it; on exit it is renamed to `out`.
+    """Yield the path of a temporary folder. The caller creates and fills it; on exit it becomes `out`.
 
-    So `out` is complete or absent. CaptureError if it exists and is not an empty folder.
+    So `out` is complete, or absent or empty. An existing folder is filled, not replaced, because it may be a
+    link, a mount point or the working folder. CaptureError if it exists and is not an empty folder.
     """
     out = Path(out)
-    is_empty_folder = out.is_dir() and not any(out.iterdir())
-    if out.exists() and not is_empty_folder:
-        raise CaptureError(
-            f"{out}: expected a new or empty folder, got one in use; remove it or choose another"
-        )
+    check_new_folder(out)
+    is_filled = out.is_dir()
     out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = out.parent / f".{out.name}.unfinished-{os.getpid()}"
-    remove_unfinished(out)
+    unfinished = (out if is_filled else out.parent) / f".{out.absolute().name}.unfinished-{os.getpid()}"
     try:
         with name_path_in_errors(out):
             yield unfinished
-        if out.exists():
-            out.rmdir()
-        unfinished.rename(out)
+        if is_filled:
+            with defer_signals():
+                for entry in sorted(unfinished.iterdir(), key=lambda entry: entry.name == CALIBRATION):
+                    entry.rename(out / entry.name)  # the calibration last: without it, this is no capture
+        else:
+            unfinished.rename(out)
     finally:
         with defer_signals():
             shutil.rmtree(unfinished, ignore_errors=True)
 
 
+def check_new_folder(out: Path) -> None:
+    """CaptureError unless `out` is absent or an empty folder; leftovers of killed processes are removed."""
+    remove_unfinished(out)
+    is_empty_folder = out.is_dir() and not any(out.iterdir())
+    if os.path.lexists(out) and not is_empty_folder:
+        raise CaptureError(
+            f"{out}: expected a new or empty folder, got one in use; remove it or choose another"
+        )
+
+
 def remove_unfinished(out: Path) -> None:
-    """Remove temporary folders of `out` that processes left behind when they were killed."""
-    for folder in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
+    """Remove temporary folders of `out` that processes left behind when they were killed.
+
+    Such a process may have had the id of this one, as in containers.
+    """
+    pattern = f".{escape(out.absolute().name)}.unfinished-*"
+    for folder in (*out.parent.glob(pattern), *out.glob(pattern)):
         _, _, process_id = folder.name.rpartition("-")
-        if not is_running(process_id):
+        if process_id == str(os.getpid()) or not is_running(process_id):
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -116,6 +132,8 @@ class _Writer:
         self.suffix = suffix
         self.kinds: set[FileKind] = {"image"}
         """Kinds of files that were written."""
+        self.written: set[str] = set()
+        """Names of cameras with an image in any frame."""
         self.masked: set[str] = set()
         """Names of cameras with a mask in any frame."""
         names = source.cameras.names
@@ -142,6 +160,11 @@ class _Writer:
                     self._write_frame(unmasked, pool)
                 if frame.mask is not None and not frame.has_subject:
                     empty.append(frame.time)
+        absent = [name for name in self.source.cameras.names if name not in self.written]
+        if absent:
+            logging.getLogger("viewmend").warning(
+                f"{self.source.name}: cameras without an image in these frames are left out: {', '.join(absent)}"
+            )
         write_calibration(self.folder, self._calibration())
         return tuple(empty)
 
@@ -159,6 +182,7 @@ class _Writer:
             self.kinds.add(kind)
             return self.folder / self._pattern(name, kind).replace("{frame}", frame_id)
 
+        self.written.add(name)
         write_image(
             file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
         )
@@ -185,6 +209,8 @@ class _Writer:
         for view, (name, (width, height)) in enumerate(
             zip(cameras.names, cameras.size_px.tolist(), strict=True)
         ):
+            if name not in self.written:  # a camera without files in all frames is no valid entry
+                continue
             kinds = self.kinds if name in self.masked else self.kinds - {"mask"}
             files: Any = {kind: self._pattern(name, kind) if kind in kinds else None for kind in FILE_KINDS}
             R, t_m = exact_pose(pose[view, :3, :3], pose[view, :3, 3])
