@@ -1,8 +1,12 @@
-"""Turntables: options in one text, and the frame of each view."""
+"""Turntables: options in one text, and the frame of each view; files of poses."""
+
+import json
 
 import pytest
+import torch
 
-from viewmend.data.camera_path import STATIC_VIEWS, Turntable, parse_turntable
+from viewmend.data.camera_path import STATIC_VIEWS, Turntable, parse_turntable, read_camera_path
+from viewmend.studio.rigs import orbit
 
 
 def test_options_follow_the_word():
@@ -35,3 +39,20 @@ def test_a_short_motion_plays_back_and_forth_or_again():
     assert Turntable(seconds=0.5, fps=16.0).times(frames, 8.0) == [3, 3, 4, 4, 5, 5, 4, 4]
     assert Turntable().times([7], None) == [7] * STATIC_VIEWS
     assert Turntable().times(list(range(100)), 25.0) == list(range(100)), "as long as the motion"
+
+
+@pytest.mark.parametrize(
+    "stated", [{}, {"K": True}, {"width": 80, "height": 40}, {"K": True, "width": 80, "height": 40}]
+)
+def test_a_path_shows_the_same_in_reduced_images(tmp_path, stated):
+    """Intrinsics and size in the file are those of unreduced images; a size that it states is kept."""
+    full = orbit([0.3], (64, 48))
+    if "K" in stated:
+        stated = stated | {"K": (full.K[0] * torch.tensor([[1.5], [1.5], [1.0]])).tolist()}
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({"world_from_camera": full.world_from_camera.tolist(), **stated}))
+    whole = read_camera_path(file, full)
+    small = read_camera_path(file, full.resized(16, 12), full_size_px=(64, 48))
+    assert small.max_size_px == ((80, 40) if "width" in stated else (16, 12))
+    torch.testing.assert_close(small.resized(*whole.max_size_px).K, whole.K)
+    assert torch.equal(read_camera_path(file, full, full_size_px=(64, 48)).K, whole.K)

@@ -86,7 +86,7 @@ def run(options: Options) -> int:
         log_preparation(capture)
         shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
         first = stream.add_frame(shown.to(options.device))
-        views = _views(options, first, capture)
+        views = _views(options, first, capture, opened.cameras[0].max_size_px)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
         more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}
         frames = track(frames, "exporting", len(times))
@@ -102,13 +102,16 @@ def run(options: Options) -> int:
     return 0
 
 
-def _views(options: Options, first: "CachedFrame", capture: "PreparedCapture") -> "Cameras":
+def _views(
+    options: Options, first: "CachedFrame", capture: "PreparedCapture", full_size_px: tuple[int, int]
+) -> "Cameras":
+    """The views to complete; `full_size_px` is the size of the first camera's images, before they are reduced."""
     from viewmend.completed_cameras import place_around
     from viewmend.data.camera_path import read_camera_path
     from viewmend.data.capture_folder import origin_of
     from viewmend.geometry.proxy import GeometryProxy
 
     if options.path is not None:
-        return read_camera_path(options.path, capture.cameras, origin_of(capture))
+        return read_camera_path(options.path, capture.cameras, origin_of(capture), full_size_px)
     assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
     return place_around(capture.cameras, first.proxy.center, capture.up, options.views)

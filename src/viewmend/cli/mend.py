@@ -136,8 +136,9 @@ def run(options: Options) -> int:
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
     usable = _find_usable_frames(opened, times, held)
+    full_size_px = opened.cameras[0].max_size_px
     if options.path is not None and turntable is None:
-        _read_poses(options, opened, times)
+        _read_poses(options, opened, times, full_size_px)
     inpainter = load_named(options.model, options.device, options.precision)
     protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
@@ -146,7 +147,7 @@ def run(options: Options) -> int:
     mender = _make_mender(options, render, inpainter, capture.bounds, held, protocol)
     if turntable is not None and turntable.background:
         mender.background = turntable.background
-    plan = _plan(options, capture, times, usable, turntable)
+    plan = _plan(options, capture, times, usable, turntable, full_size_px)
     fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
     summary = MendSummary(protocol)
     _mend_views(options, mender, capture, plan, fps, summary)
@@ -331,18 +332,26 @@ def _find_usable_frames(capture: "CaptureFolder", times: range, held: tuple[str,
 
 
 def _plan(
-    options: Options, capture: "CaptureSource", times: range, usable: list[int], turntable: "Turntable | None"
+    options: Options,
+    capture: "CaptureSource",
+    times: range,
+    usable: list[int],
+    turntable: "Turntable | None",
+    full_size_px: tuple[int, int],
 ) -> "list[tuple[int, Cameras]]":
     """The frame and the camera of each view, in order; without views of frames that are not usable."""
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in usable]
     if turntable is not None:
         return _circle(turntable, capture, usable)
-    return [(time, pose) for time, pose in _read_poses(options, capture, times) if time in usable]
+    poses = _read_poses(options, capture, times, full_size_px)
+    return [(time, pose) for time, pose in poses if time in usable]
 
 
-def _read_poses(options: Options, capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
-    """The frames with the poses in the file of --path.
+def _read_poses(
+    options: Options, capture: "CaptureSource", times: range, full_size_px: tuple[int, int]
+) -> "list[tuple[int, Cameras]]":
+    """The frames with the poses in the file of --path; `full_size_px` is the first camera's, before --scale.
 
     Raises:
         ValueError: the file has other content, or another number of poses.
@@ -350,7 +359,7 @@ def _read_poses(options: Options, capture: "CaptureSource", times: range) -> "li
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
     from viewmend.data.capture_folder import origin_of
 
-    path = read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture))
+    path = read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture), full_size_px)
     return pair_with_frames(path, times)
 
 

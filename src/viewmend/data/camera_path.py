@@ -46,13 +46,20 @@ class PathFile(Struct, frozen=True):
             raise ValueError("expected both 'width' and 'height', got one of them; write both or neither")
 
 
-def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3"] | None = None) -> Cameras:
+def read_camera_path(
+    file: Path,
+    like: Cameras,
+    origin_m: Float64[np.ndarray, "3"] | None = None,
+    full_size_px: tuple[int, int] | None = None,
+) -> Cameras:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
     with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
     0.5), "width" and "height". `origin_m` is the origin of `like` in the coordinates of the capture's
     files (`origin_of`). Poses that are nearer to it than to 0 are taken to be in those coordinates.
+    `full_size_px` is the size of the first camera's images if those of `like` are reduced: what the
+    file says of intrinsics and size is for unreduced images, and views are reduced if it says no size.
     ValueError if the file has other content.
     """
     try:
@@ -74,11 +81,14 @@ def read_camera_path(file: Path, like: Cameras, origin_m: Float64[np.ndarray, "3
             poses[:, :3, 3] = moved
     poses = poses.float()
     first = like[0]
+    reduced = full_size_px is not None and (path.K is not None or path.width is not None)
+    full = first.resized(*full_size_px) if full_size_px is not None and reduced else first
     count = len(poses)
-    K = first.K.cpu() if path.K is None else torch.tensor([path.K])
-    size = first.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
+    K = full.K.cpu() if path.K is None else torch.tensor([path.K])
+    size = full.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
     names = tuple(f"view{n:03d}" for n in range(count))
-    return Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
+    cameras = Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
+    return cameras.resized(*first.max_size_px) if reduced and path.width is None else cameras
 
 
 class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
