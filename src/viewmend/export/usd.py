@@ -47,7 +47,7 @@ def _usd_camera(prim: str, camera: Cameras, pose: list[list[float]]) -> list[str
         "verticalApertureOffset": (float(K[1, 2]) - height / 2) * per_y,
     }
     return [
-        f'def Camera "{prim}" (displayName = {json.dumps(camera.names[0])})',
+        f'def Camera "{prim}" (displayName = {json.dumps(camera.names[0], ensure_ascii=False)})',
         "{",
         *(f"    float {name} = {value:.9g}" for name, value in values.items()),
         "    float2 clippingRange = (0.01, 1000)",

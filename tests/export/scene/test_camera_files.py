@@ -26,7 +26,7 @@ def odd_rig() -> Cameras:
     K = rig.K.clone()
     K[:, 0, 0] *= 1.2
     K[:, :2, 2] += torch.tensor([5.0, -3.0])
-    return Cameras(("1 a", "1-a", "b"), K, rig.camera_from_world, torch.tensor([[64, 48]] * 3))
+    return Cameras(("1 a", "1-a", "bühne"), K, rig.camera_from_world, torch.tensor([[64, 48]] * 3))
 
 
 RIG, ROTATION = odd_rig(), engine_from_world(torch.tensor([0.0, 0.3, 1.0]))
@@ -46,7 +46,7 @@ def test_usd_cameras_project_as_ours():
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (25, 6)
     scope = stage.GetPrimAtPath("/scene/rig")
-    assert [p.GetName() for p in scope.GetChildren()] == ["camera_1_a", "camera_1_a_1", "b"]
+    assert [p.GetName() for p in scope.GetChildren()] == ["camera_1_a", "camera_1_a_1", "b_hne"]
     assert [p.GetDisplayName() for p in scope.GetChildren()] == list(RIG.names)
     uv, _ = project(POINTS, RIG)
     for view, prim in enumerate(scope.GetChildren()):
@@ -91,7 +91,7 @@ def test_blender_cameras_project_as_ours(tmp_path, monkeypatch):
         (tmp_path / "hull" / f"{n:06d}.glb").touch()
     square = replace(RIG, K=RIG.K.clone())
     square.K[:, 1, 1] = square.K[:, 0, 0]
-    script = blender_script({"rig": square}, ROTATION, 25.0, 2, {"b": "rgba/b/000000.png"})
+    script = blender_script({"rig": square}, ROTATION, 25.0, 2, {"bühne": "rgba/bühne/000000.png"})
     made, shown, bpy = opened(script, tmp_path, monkeypatch)
     uv, _ = project(POINTS, square)
     for view, name in enumerate(square.names):
@@ -106,7 +106,7 @@ def test_blender_cameras_project_as_ours(tmp_path, monkeypatch):
     files = [str(call.kwargs["filepath"])[-10:] for call in bpy.ops.import_scene.gltf.call_args_list]
     assert files == ["000000.glb", "000001.glb"]
     assert {("hide_render", 1, False), ("hide_render", 2, True), ("hide_viewport", 0, True)} <= set(shown)
-    assert bpy.data.images.load.call_args.args == (str(tmp_path / "rgba/b/000000.png"),)
+    assert bpy.data.images.load.call_args.args == (str(tmp_path / "rgba/bühne/000000.png"),)
 
 
 def test_the_script_is_data_and_code_apart(tmp_path):
