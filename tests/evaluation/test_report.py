@@ -125,6 +125,19 @@ def test_every_scene_has_a_contact_sheet(evaluated, tmp_path):
     assert shown == [[True, True, False], *[[True] * 3] * 3, [True, True, False]]
 
 
+def test_sheets_of_scenes_whose_names_make_one_file_name_are_all_kept(
+    make_cell, make_frame, tmp_path, monkeypatch
+):
+    sheets = {name: np.full((4, 4, 3), n, np.uint8) for n, name in enumerate(("人-左", "人-右", "s3"))}
+    monkeypatch.setattr(
+        "viewmend.evaluation.report_page.scene_sheet", lambda own, _: sheets[own[0].key.scene]
+    )
+    cells = [make_cell(name, "telea", "A", [make_frame()]) for name in sheets]
+    written = write_sheets(cells, CellStore(tmp_path / "cells"), tmp_path)
+    assert [int(read_rgb(path, str(path)).mean()) for path in written] == [0, 1, 2]
+    assert written[2] == tmp_path / "s3.png"
+
+
 def test_the_page_shows_three_scores_and_explains_every_column(evaluated):
     report, _, store = evaluated
     shown = page(report, store)

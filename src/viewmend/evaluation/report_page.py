@@ -46,14 +46,20 @@ def page(report: Report, store: CellStore, shown: int = 12) -> str:
 
 
 def write_sheets(cells: Sequence[Cell], store: CellStore, folder: Path) -> list[Path]:
-    """Write FOLDER/SCENE.png for every scene that has images; returns the files."""
+    """Write FOLDER/SCENE.png for every scene that has images; returns the files.
+
+    Names that are the same once they are part of a file name are numbered.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for scene in dict.fromkeys(cell.key.scene for cell in cells):
+    written: list[Path] = []
+    for number, scene in enumerate(dict.fromkeys(cell.key.scene for cell in cells)):
         sheet = scene_sheet([cell for cell in cells if cell.key.scene == scene], store)
         if sheet is not None:
-            written.append(folder / f"{slug(scene)}.png")
-            write_image(written[-1], sheet)
+            file = folder / f"{slug(scene)}.png"
+            if file in written:
+                file = folder / f"{slug(scene)}--{number}.png"
+            written.append(file)
+            write_image(file, sheet)
     return written
 
 
