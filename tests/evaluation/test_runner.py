@@ -191,6 +191,16 @@ def test_a_scene_that_fails_fails_for_every_method(small_scenes, tmp_path):
     assert all("cam99" in cell.error for cell in cells.values()) and len(cells) == len(METHODS)
 
 
+def test_attributes_that_refer_to_each_other_are_one_clear_error(small_scenes, tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from viewmend.models.classical import Telea\nclass Own(Telea):\n"
+        "    def __init__(self):\n        self.again = [self]\n"
+    )
+    with pytest.raises(ValueError, match=r"own\.py:Own: expected attributes that identify the method"):
+        run(small_scenes, tmp_path / "cells", (f"{path}:Own",))
+
+
 def test_scenes_of_one_name_and_unknown_methods_are_refused(small_scenes, tmp_path):
     with pytest.raises(ValueError, match="different names"):
         run([small_scenes[0]] * 2, tmp_path)

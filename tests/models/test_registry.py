@@ -1,5 +1,6 @@
 """Methods by name: groups, baselines without weights, classes in files."""
 
+import numpy as np
 import pytest
 
 from viewmend.metrics.weights import FOLDERS_VARIABLE
@@ -73,6 +74,27 @@ def test_a_class_in_a_file_is_a_method_and_a_changed_file_another(tmp_path):
     assert made.device == "cpu" and identity(made) == identity(make_method(f"{path}:Mine"))
     path.write_text(OWN + "\n# better\n")
     assert identity(make_method(f"{path}:Mine")) != identity(made)
+
+
+@pytest.mark.parametrize(
+    "kept", ["np.load(file)", "file.read_bytes()", "set(file.read_bytes())", "Holder(np.load(file))"]
+)
+def test_weights_in_any_container_make_another_method(kept, tmp_path):
+    """Stored results of the old weights must not be taken for those of the new ones."""
+    path = tmp_path / "own.py"
+    file = tmp_path / "weights.npy"
+    start = (
+        "import logging\nimport numpy as np\nfrom pathlib import Path\nfrom viewmend.models.classical import Telea\n"
+        "class Holder:\n    def __init__(self, values):\n        self.values = values\n"
+        f"file = Path({str(file)!r})\n"
+    )
+    log = "        self.log = logging.getLogger('own')\n"
+    path.write_text(f"{start}class Own(Telea):\n    def __init__(self):\n        self.kept = {kept}\n{log}")
+    found = []
+    for weight in (1.0, 1.0, 2.0):
+        np.save(file, np.full(3, weight, np.float32))
+        found.append(identity(make_method(f"{path}:Own")))
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_class_need_not_take_the_device(tmp_path):

@@ -184,9 +184,18 @@ def method_identities(names: tuple[str, ...], settings: RunSettings) -> dict[str
     """`identity` of each method; making them here reports errors before any scene is run.
 
     Raises:
-        ValueError: a method is unknown or cannot be loaded.
+        ValueError: a method is unknown or cannot be loaded, or its attributes refer to each other.
     """
-    return {name: identity(make_method(name, settings.device, settings.precision)) for name in names}
+    found = {}
+    for name in names:
+        try:
+            found[name] = identity(make_method(name, settings.device, settings.precision))
+        except RecursionError:
+            raise ValueError(
+                f"{name}: expected attributes that identify the method, got some that refer back to each other; keep "
+                "these in variables of the module"
+            ) from None
+    return found
 
 
 def to_cells(

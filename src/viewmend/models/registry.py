@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -10,6 +11,7 @@ from functools import partial
 from inspect import signature
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -180,6 +182,15 @@ def identity(inpainter: object) -> str:
         return f"[{', '.join(map(identity, inpainter))}]"
     if isinstance(inpainter, str | int | float | bool | Enum | Path | torch.dtype | None):
         return repr(inpainter)
+    if isinstance(inpainter, np.ndarray | np.generic):
+        data = np.ascontiguousarray(inpainter).tobytes()
+        return f"numpy.{inpainter.dtype}{inpainter.shape}:{hashlib.sha256(data).hexdigest()}"
+    if isinstance(inpainter, bytes | bytearray):
+        return f"bytes:{hashlib.sha256(inpainter).hexdigest()}"
+    if isinstance(inpainter, set | frozenset):
+        return f"[{', '.join(sorted(map(identity, inpainter)))}]"
+    if isinstance(inpainter, logging.Logger):  # refers to all other loggers, and they to it
+        return repr(inpainter.name)
     if isinstance(inpainter, partial):
         return (
             f"partial({identity(inpainter.func)}, {identity(inpainter.args)}, {identity(inpainter.keywords)})"
