@@ -131,3 +131,32 @@ def test_options_out_of_range_are_refused(tmp_path, capsys, option, text):
     assert main(["publish", str(tmp_path / "ball"), str(tmp_path / "out"), "--model", "telea", option]) == 2
     assert text in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_frames_of_one_camera_are_skipped(tmp_path, capsys):
+    capture = tmp_path / "ball"
+    write_capture(BallCapture(CAMERAS, 3), capture, images="png")
+    for name in CAMERAS.names[1:]:
+        sorted((capture / "image" / name).iterdir())[0].unlink()
+    arguments = [str(capture), "--model", "telea", "--geometry", "hull"]
+    assert main(["publish", *arguments, str(tmp_path / "page"), "--completed-cameras", "0"]) == 0
+    said = "1 of 3 frames have fewer than two usable cameras and were skipped; the first is '000'"
+    assert said in capsys.readouterr().err
+    assert json.loads((tmp_path / "page/scene.json").read_text())["frames"] == 2
+    assert main(["export-scene", *arguments, str(tmp_path / "scene"), "--views", "1"]) == 0
+    assert said in capsys.readouterr().err
+    assert len(list((tmp_path / "scene/hull").glob("*.glb"))) == 2
+    for command in ("publish", "export-scene"):
+        assert main([command, *arguments, str(tmp_path / command), "--frames", "0:1"]) == 2
+        assert "ball: expected a frame with two usable cameras, got none" in capsys.readouterr().err
+        assert not (tmp_path / command).exists()
+
+
+@pytest.mark.parametrize("command", ["publish", "export-scene"])
+def test_the_model_that_predicts_depth_has_the_precision_that_was_asked_for(tmp_path, command, monkeypatch):
+    write_capture(BallCapture(CAMERAS, 1), tmp_path / "ball", images="png")
+    asked = []
+    monkeypatch.setattr("viewmend.models.registry.error_model_for", lambda *given: asked.append(given[1:]))
+    given = ["--model", "telea", "--geometry", "fused", "--precision", "float32"]
+    assert main([command, str(tmp_path / "ball"), str(tmp_path / "out"), *given]) == 2
+    assert asked == [("cpu", "float32")]

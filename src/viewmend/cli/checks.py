@@ -1,7 +1,7 @@
 """Options, checks of options, and messages that several commands share."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from viewmend.data.source import CaptureSource
     from viewmend.models.base import Inpainter
     from viewmend.rendering.view import RenderConfig
+    from viewmend.types import MultiViewFrame
 
 Geometry = Literal["hull", "fused"]
 """The kinds of geometry proxy, as in `StreamConfig.geometry`."""
@@ -152,6 +153,29 @@ def log_preparation(capture: "PreparedCapture") -> None:
     """Report what preparation changed in a capture. Issues have already been logged as warnings."""
     for text in capture.changes:
         say(text)
+
+
+def with_two_cameras(
+    frames: "Iterable[MultiViewFrame]", source: "CaptureSource", count: int
+) -> "Iterator[MultiViewFrame]":
+    """Those of `count` frames of which a hull can be computed; reports the others, which are skipped.
+
+    Raises:
+        ValueError: there is no such frame.
+    """
+    skipped = []
+    for frame in frames:
+        if len(frame.cameras) >= 2:
+            yield frame
+        else:
+            skipped.append(source.frame_ids[frame.time])
+    if len(skipped) == count:
+        raise ValueError(
+            f"{source.name}: expected a frame with two usable cameras, got none; choose other --frames"
+        )
+    if skipped:
+        number = f"{len(skipped)} of {count} frames"
+        say(f"{number} have fewer than two usable cameras and were skipped; the first is '{skipped[0]}'")
 
 
 def without_subject(source: "CaptureSource", times: Collection[int], count: int) -> str:

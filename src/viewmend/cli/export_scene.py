@@ -62,7 +62,7 @@ def run(options: Options) -> int:
     check_least(options, views=1)
     if not 0 <= options.min_confidence <= 1:
         raise ValueError(f"expected --min-confidence from 0 to 1, got {options.min_confidence}; choose again")
-    from viewmend.cli.checks import chosen_times, load_named, log_preparation
+    from viewmend.cli.checks import chosen_times, load_named, log_preparation, with_two_cameras
     from viewmend.cli.console import say, track
     from viewmend.data.prepare import first_with_subject, open_masked, prepare
     from viewmend.data.source import prefetch
@@ -76,7 +76,7 @@ def run(options: Options) -> int:
     times = chosen_times(options.frames, len(opened.frame_ids))
     inpainter = load_named(options.model, options.device, options.precision)
     needs_model = inpainter.needs_mask or options.geometry == "fused"
-    error_model = error_model_for(inpainter, options.device) if needs_model else None
+    error_model = error_model_for(inpainter, options.device, options.precision) if needs_model else None
     stream = Stream(inpainter, StreamConfig(geometry=options.geometry), opened.bounds, error_model)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
@@ -84,10 +84,11 @@ def run(options: Options) -> int:
         size = options.max_image_size
         capture = prepare(opened, max_image_size=size, **prepared, first=times[0])
         log_preparation(capture)
-        shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
+        shown = first_with_subject(capture, first=times[0], least=2) or capture.read(times[0])
         first = stream.add_frame(shown.to(options.device))
         views = _views(options, first, capture, opened.cameras[0].max_size_px)
-        frames = (frame.to(options.device) for frame in prefetch(capture, times))
+        usable = with_two_cameras(prefetch(capture, times), capture, len(times))
+        frames = (frame.to(options.device) for frame in usable)
         more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}
         frames = track(frames, "exporting", len(times))
         written = export_scene(frames, stream, views, capture.cameras, folder.draft, **more)

@@ -69,7 +69,7 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; the exit code."""
     _check(options)
-    from viewmend.cli.checks import chosen_times, load_named, log_preparation
+    from viewmend.cli.checks import chosen_times, load_named, log_preparation, with_two_cameras
     from viewmend.cli.console import say, track
     from viewmend.data.prepare import first_with_subject
     from viewmend.data.source import prefetch
@@ -87,7 +87,7 @@ def run(options: Options) -> int:
         inpainter,
         StreamConfig(geometry=options.geometry, render=render),
         capture.bounds,
-        error_model_for(inpainter, options.device) if needs_model else None,
+        error_model_for(inpainter, options.device, options.precision) if needs_model else None,
     )
     config = PublishConfig(
         title=options.title or capture.name,
@@ -98,9 +98,10 @@ def run(options: Options) -> int:
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
         log_preparation(capture)
-        shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
+        shown = first_with_subject(capture, first=times[0], least=2) or capture.read(times[0])
         first = stream.add_frame(shown.to(options.device))
-        frames = (frame.to(options.device) for frame in prefetch(capture, times))
+        usable = with_two_cameras(prefetch(capture, times), capture, len(times))
+        frames = (frame.to(options.device) for frame in usable)
         made = publish(
             track(frames, "publishing", len(times)),
             len(times),

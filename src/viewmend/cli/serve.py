@@ -125,7 +125,7 @@ def run(options: Options) -> int:
         inpainter,
         stream_config(options),
         options.device,
-        error_model_for(inpainter, options.device),
+        error_model_for(inpainter, options.device, options.precision),
         draws_in_page=config.draws_in_page,
         precision=options.precision,
         completed_cameras=MAX_COMPLETED,
