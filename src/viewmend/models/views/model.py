@@ -396,18 +396,18 @@ class ViewSynthNet(Network):
     ) -> tuple[AggregatedSamples, Int[Tensor, "cell view"] | None]:
         """The aggregated samples of the rays of cells, and the cameras chosen for each; computed in chunks."""
         parts = []
-        cameras = []
+        chosen: list[Int[Tensor, "cell view"]] = []
         for chunk in rays.split(sources.rays_at_once):
             stop_if_cancelled()
             choice = CameraChoice(CHOOSING_SAMPLES, RAY_VIEWS)
             samples = sample_rays(chunk, sources, step_px=float(CELL_PX), choice=choice)
             parts.append(self.sample_aggregator(samples))
-            cameras.append(samples.cameras)
-        # pyrefly: ignore[bad-argument-type]
+            if samples.cameras is not None:
+                chosen.append(samples.cameras)
         aggregated = AggregatedSamples.cat(parts)
-        if len(cameras) == 1 or cameras[0] is None:  # None: all rays are sampled in all cameras
-            return aggregated, cameras[0]
-        return aggregated, torch.cat(cameras)
+        if not chosen:  # all rays are sampled in all cameras
+            return aggregated, None
+        return aggregated, torch.cat(chosen) if len(chosen) > 1 else chosen[0]
 
     def _blend(
         self,
