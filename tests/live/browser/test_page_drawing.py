@@ -12,8 +12,10 @@ from reference.ball import photograph
 
 from viewmend.cli import serve
 from viewmend.live.client import Publisher
+from viewmend.live.connection import ClosingError
 from viewmend.live.encoding import draw_mode
 from viewmend.live.poses import view_camera
+from viewmend.live.protocol import CloseCode
 from viewmend.live.push import PushSource
 from viewmend.live.renderer import RenderRequest
 from viewmend.models.base import RenderQuality
@@ -223,6 +225,39 @@ def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, ball):
     with opened(browser, ball, query="", route=busy) as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
     assert max(tries.values()) >= 3
+
+
+def test_a_paused_frame_whose_assets_failed_is_fetched_again(browser, ball):
+    tries = Counter()
+
+    def fail_once(route):
+        tries[route.request.url] += 1
+        if tries[route.request.url] == 1:
+            route.fulfill(status=404, body="{}")
+        else:
+            route.continue_()
+
+    with opened(browser, ball, query="?time=0", route=fail_once) as view:
+        view.until(lambda: view.data("drawn") == "0", 30)
+
+
+def test_after_an_outage_a_new_connection_lets_the_page_draw_again(browser, ball):
+    out = [True]
+
+    def fail(route):
+        if out[0]:
+            route.fulfill(status=404, body="{}")
+        else:
+            route.continue_()
+
+    with opened(browser, ball, query="?time=0", route=fail) as view:
+        view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)  # the server draws
+        assert view.data("drawn") is None
+        out[0] = False
+        for connection in list(ball.live.registry.connections):
+            error = ClosingError(CloseCode.TIMEOUT, "an outage")
+            connection._loop.call_soon_threadsafe(connection.fail, error)
+        view.until(lambda: view.data("drawn") == "0", 30)
 
 
 @pytest.mark.parametrize("scene", ["wd2", "utrecht", "studio"])

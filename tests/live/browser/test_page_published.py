@@ -175,12 +175,16 @@ def test_a_path_becomes_a_film_without_a_server(browser, host, tmp_path):
     assert np.abs(frames[0].astype(int) - frames[30]).mean() < 2, "a whole turn"
 
 
-def test_missing_files_are_reported(browser, host):
+def test_missing_files_are_reported_and_requested_again(browser, host):
     with Performance(browser, f"{host}some/ball/#time=0") as page:
         page.paused(0)
         page.page.route("**/frames/**", lambda route: route.abort())
         page.page.locator("#seek").fill("2")
-        page.until(lambda: "missing" in page.page.locator("#cover-text").inner_text(), SCREENSHOT_S)
+        cover = page.page.locator("#cover")
+        page.until(lambda: "missing" in cover.inner_text() and "Retrying" in cover.inner_text(), 60)
+        page.page.unroute("**/frames/**")
+        page.paused(2)
+        assert cover.is_hidden()
         page.errors.clear()
 
 

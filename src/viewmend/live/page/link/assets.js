@@ -11,6 +11,7 @@ import { dot, sub, unit } from "../view/matrix.js";
  * @property {number} time its index
  * @property {Shape | null} shape
  * @property {Map<number, CameraImage>} images by the camera's number
+ * @property {Set<number | "mesh">} extras numbers of the completed views that were requested, also those that the
  *   server no longer has; "mesh" for its fused mesh
  * @property {Frame | null} fused the same frame with the mesh that the server fused from predicted depth
  * @property {number} requestedAt ms
@@ -152,13 +153,13 @@ export class Assets extends EventTarget {
     return this.version !== null && this.failures < MAX_FAILURES;
   }
 
-  /** Use the assets of a rig. @param {any} rig the message */
+  /** Use the assets of a rig, also after too many frames have failed. @param {any} rig the message */
   open(rig) {
+    this.failures = 0;
     if (rig.assets === this.version) return;
     this.#clear();
     this.completed.clear();
     this.version = rig.assets ?? null;
-    this.failures = 0;
     if (this.version === null || this.worker) return;
     this.worker = new Worker(new URL("./asset_worker.js", import.meta.url), { type: "module" });
     this.worker.onmessage = ({ data }) => this.#take(data);
@@ -476,13 +477,15 @@ export class Assets extends EventTarget {
     frame.fused = { ...frame, shape: { ...mesh, header } };
   }
 
-  /** Try a frame again later, when it is next requested. @param {Frame} frame */
+  /** Try a frame again later; it counts once, however many of its assets fail. @param {Frame} frame */
   #fail(frame) {
+    if (frame.failed) return;
     frame.failed = true;
     this.failures += 1;
     setTimeout(() => {
       if (this.frames.get(frame.time) === frame && !frame.shape) this.frames.delete(frame.time);
       frame.failed = false;
+      this.dispatchEvent(new CustomEvent("change", { detail: frame }));
     }, RETRY_MS);
   }
 }

@@ -5,6 +5,8 @@ import { parsePose, parseFrameIndex } from "../view/url_state.js";
 
 /** The state is dispatched at this interval, in milliseconds. */
 const STATE_MS = 500;
+/** After an error, the files are requested again after this long, in seconds. */
+const RETRY_S = 5;
 /** A turntable leaves this share of its images free around the subject. */
 const MARGIN = 0.06;
 /** A turntable is at least this many radii from the subject's centre. */
@@ -28,10 +30,16 @@ export class Recording extends EventTarget {
     this.speed = 1;
     /** The position at a moment, in frames. */
     this.anchor = { position: 0, at: performance.now() };
+    /** Opens the performance again after an error; 0 while there is none. */
+    this.timer = 0;
   }
 
+  /** Load the performance, or load it again after an error. */
   async open() {
+    clearTimeout(this.timer);
+    this.timer = 0;
     this.#reportStatus("connecting", "");
+    const isFirst = this.scene === null;
     try {
       const response = await this.load();
       if (!response.ok) throw new Error(`scene.json: the host answered ${response.status}`);
@@ -40,17 +48,21 @@ export class Recording extends EventTarget {
       this.fail(String(/** @type {Error} */ (error).message ?? error));
       return;
     }
-    this.anchor.at = performance.now();
+    if (isFirst) {
+      this.anchor.at = performance.now();
+      setInterval(() => this.#reportState(), STATE_MS);
+      window.addEventListener("hashchange", () => this.#showUrl());
+    }
     this.#reportStatus("open", "");
     this.#dispatch("rig", this.scene.rig);
     this.#reportState();
-    setInterval(() => this.#reportState(), STATE_MS);
-    window.addEventListener("hashchange", () => this.#showUrl());
   }
 
-  /** Report an error that cannot be resolved. @param {string} text */
+  /** Report an error, and try again later. @param {string} text */
   fail(text) {
-    this.#reportStatus("refused", text);
+    if (this.timer) return;
+    this.#reportStatus("lost", text, RETRY_S);
+    this.timer = window.setTimeout(() => void this.open(), 1000 * RETRY_S);
   }
 
   /** Do nothing: there is no server to render a view. */
@@ -133,9 +145,9 @@ export class Recording extends EventTarget {
     });
   }
 
-  /** @param {string} status @param {string} text */
-  #reportStatus(status, text) {
-    this.#dispatch("status", { status, text, wait_s: 0 });
+  /** @param {string} status @param {string} text @param {number} [wait_s] */
+  #reportStatus(status, text, wait_s = 0) {
+    this.#dispatch("status", { status, text, wait_s });
   }
 
   /** @param {string} name @param {any} detail */
