@@ -110,6 +110,17 @@ def test_a_link_restores_pose_frame_and_mode(browser, host):
         page.paused(1)
 
 
+def test_links_to_what_a_performance_does_not_have_show_what_it_has(browser, host):
+    with Performance(browser, f"{host}some/ball/#time=5") as page:
+        last = page.paused(FRAMES - 1)
+        page.page.wait_for_timeout(1200)
+        assert page.data("drawn") == str(FRAMES - 1)
+        page.page.evaluate("location.hash = 'time=3&mode=depth'")
+        page.page.wait_for_timeout(300)
+        assert np.abs(page.picture() - last).mean() < 0.2
+        assert page.page.locator("#modes [aria-checked=true]").inner_text() == "Completed"
+
+
 def test_the_time_line_plays_and_seeks(browser, host):
     with Performance(browser, f"{host}some/ball/") as page:
         seen = set()

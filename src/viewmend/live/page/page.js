@@ -256,7 +256,7 @@ class Page {
       motion.moveTo(target);
     }
     if (time !== undefined) transport.pauseAt(time);
-    if (mode) settings.set("mode", mode, false);
+    if (mode && this.source.modes.includes(mode)) settings.set("mode", mode, false);
     this.wake();
   }
 

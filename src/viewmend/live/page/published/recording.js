@@ -76,7 +76,8 @@ export class Recording extends EventTarget {
 
   /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} change */
   changeClock({ playing, speed, seek, live }) {
-    this.#setPosition(seek ?? this.#computePosition());
+    const position = seek ?? this.#computePosition();
+    this.#setPosition(Math.min(position, this.scene.frames - 1));
     if (speed !== undefined) this.speed = speed;
     if (playing !== undefined) this.playing = playing;
     if (live) this.playing = true;
