@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from live.browser import scene
+from live.browser.conftest import opened
 
 pytestmark = pytest.mark.slow
 
@@ -86,7 +87,7 @@ HEADSET = """
     async updateRenderState() {}
     async requestReferenceSpace() { return {}; }
     requestAnimationFrame(paint) { this.timer = setTimeout(() => paint(0, {getViewerPose: () => ({views})}), 30); }
-    end() { clearTimeout(this.timer); this.dispatchEvent(new Event('end')); }
+    async end() { clearTimeout(this.timer); this.dispatchEvent(new Event('end')); }
   };
   const xr = {isSessionSupported: async () => true, requestSession: async () => session};
   Object.defineProperty(navigator, 'xr', {value: xr});
@@ -121,6 +122,17 @@ def test_a_headset_gets_two_eyes_of_one_state(browser, server):
     page.wait_for_timeout(500)
     assert "camera" in server.looks[-1]
     context.close()
+
+
+def test_a_session_that_ends_while_it_starts_leaves_the_page_as_it_was(browser, server):
+    ends = "WebGL2RenderingContext.prototype.makeXRCompatible = async () => { window.endSession(); };"
+    with opened(browser, server, script=HEADSET + ends) as view:
+        view.settle()
+        view.page.get_by_role("button", name="Enter VR").click()
+        view.page.wait_for_timeout(300)
+        count = len(server.looks)
+        view.drag(60, 0)
+        view.until(lambda: len(server.looks) > count and "camera" in server.looks[-1], 20)
 
 
 def test_without_a_headset_there_is_no_button(desktop):

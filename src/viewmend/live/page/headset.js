@@ -90,8 +90,29 @@ export class Headset {
    */
   async enter(rig, pose) {
     const xr = /** @type {any} */ (navigator).xr;
-    const { gl } = this.stage;
+    if (!rig) throw new Error("there is no view yet");
     const session = await xr.requestSession("immersive-vr", { optionalFeatures: ["local-floor"] });
+    this.session = session;
+    session.addEventListener("end", () => {
+      this.session = null;
+      this.page.ended();
+    });
+    try {
+      await this.#begin(session, rig, pose);
+    } catch (error) {
+      await session.end().catch(() => null); // it may have ended by itself
+      throw error;
+    }
+  }
+
+  /**
+   * Paint in a session until it ends.
+   * @param {any} session
+   * @param {any} rig
+   * @param {any} pose
+   */
+  async #begin(session, rig, pose) {
+    const { gl } = this.stage;
     await /** @type {any} */ (gl).makeXRCompatible();
     const layer = new /** @type {any} */ (window).XRWebGLLayer(session, gl);
     await session.updateRenderState({ baseLayer: layer, depthNear: NEAR_M, depthFar: FAR_M });
@@ -99,11 +120,6 @@ export class Headset {
       .requestReferenceSpace("local-floor")
       .catch(() => session.requestReferenceSpace("local"));
     const floor = computeFloor(rig, pose);
-    this.session = session;
-    session.addEventListener("end", () => {
-      this.session = null;
-      this.page.ended();
-    });
     const paint = (/** @type {number} */ _now, /** @type {any} */ frame) => {
       if (this.session !== session) return;
       session.requestAnimationFrame(paint);
