@@ -99,7 +99,7 @@ export class Notices {
   /** Find what is wrong with the connection; null for nothing. @returns {Situation | null} */
   #checkConnection() {
     const { status, text, wait_s, since } = this.connection;
-    if (status === "refused") return { kind: "error", title: "Access denied", text };
+    if (status === "refused") return { kind: "error", title: "Cannot connect", text };
     if (status === "lost") {
       const remaining = Math.max(0, Math.ceil(wait_s - (performance.now() - since) / 1000));
       return { kind: "lost", title: text, text: `Retrying in ${remaining} s.`, retry: true };
