@@ -48,6 +48,7 @@ export class Keys {
     this.held = new Set();
     this.shift = false;
     window.addEventListener("keydown", (event) => {
+      if (event.metaKey) this.held.clear(); // macOS does not report the release of other keys while it is held
       if (event.altKey || event.ctrlKey || event.metaKey || document.querySelector("dialog[open]")) return;
       if (isUsedByControl(event)) return;
       this.shift = event.shiftKey;
