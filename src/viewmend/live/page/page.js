@@ -214,6 +214,7 @@ class Page {
     this.canvas.addEventListener("webglcontextlost", (/** @type {Event} */ event) => event.preventDefault());
     this.canvas.addEventListener("webglcontextrestored", () => {
       this.stage.prepare();
+      this.original.repeat();
       this.drawn = null;
       this.link.lastRequest = "";
       this.showSources([], undefined);

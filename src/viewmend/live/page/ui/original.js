@@ -66,6 +66,12 @@ export class Original {
     image.src = url.href;
   }
 
+  /** Request images and scores again, because the ones on the GPU were lost. */
+  repeat() {
+    this.requestedUrl = "";
+    this.scores.show(null);
+  }
+
   /**
    * Show the PSNR of a model, and the error map of the server's own.
    * @param {import("./scores.js").ScoreRequest | null} request
