@@ -7,6 +7,29 @@ from live.browser.conftest import opened
 pytestmark = pytest.mark.slow
 
 
+FILL_TWICE = """async () => {
+  const { HoleFill } = await import('/page/draw/fill.js');
+  const gl = new OffscreenCanvas(64, 64).getContext('webgl2');
+  const fill = new HoleFill(gl);
+  gl.clearColor(1, 0, 0, 0);
+  gl.clear(gl.COLOR_BUFFER_BIT);
+  for (const height of [0, 64]) {
+    const lens = { fx: 64, fy: 64, cx: 32, cy: 32, width: 64, height };
+    const viewer = { R: [1, 0, 0, 0, 1, 0, 0, 0, 1], T: [0, 0, 4], lens };
+    fill.draw([[-1, -1, -1], [1, 1, 1]], viewer, [0, 0, 64, height], [0, 0, 0]);
+  }
+  const pixel = new Uint8Array(4);
+  gl.readPixels(32, 32, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+  return [...pixel];
+}"""
+"""Fills the holes of a page without height, then those of a canvas that is one red hole; returns its colour."""
+LOSE_GPU = (
+    "(async () => { const gl = document.querySelector('#picture').getContext('webgl2');"
+    " const e = gl.getExtension('WEBGL_lose_context'); e.loseContext();"
+    " await new Promise(r => setTimeout(r, 200)); e.restoreContext(); })()"
+)
+
+
 def cover(view) -> str:
     return view.page.locator("#cover").inner_text() if view.page.locator("#cover").is_visible() else ""
 
@@ -146,14 +169,37 @@ def test_who_wants_no_motion_gets_none(browser, server):
 
 def test_a_lost_gpu_comes_back(desktop):
     before = desktop.picture()
-    desktop.page.evaluate(
-        "(async () => { const gl = document.querySelector('#picture').getContext('webgl2');"
-        " const e = gl.getExtension('WEBGL_lose_context'); e.loseContext();"
-        " await new Promise(r => setTimeout(r, 200)); e.restoreContext(); })()"
-    )
+    desktop.page.evaluate(LOSE_GPU)
     desktop.page.wait_for_timeout(500)
     desktop.drag(40, 0)
     desktop.page.get_by_role("button", name="Reset the view").click()
     desktop.settle()
     assert np.abs(desktop.picture() - before).mean() < 2
     desktop.errors.clear()
+
+
+def test_a_lost_gpu_comes_back_with_the_original(browser, server):
+    with opened(browser, server, query="?sharp=0&mode=split&left=completed&right=original") as view:
+        view.settle()
+        view.page.locator("#cameras").get_by_role("button", name="cam03").click()
+        name = view.page.locator("#right-name")
+        view.until(lambda: name.inner_text() == "Original", 60)
+        view.settle()
+        view.page.evaluate(LOSE_GPU)
+        view.until(lambda: name.inner_text() != "Original", 20)
+        view.until(lambda: name.inner_text() == "Original", 20)
+        view.errors.clear()
+
+
+def test_holes_are_filled_after_the_page_had_no_height(desktop):
+    assert desktop.page.evaluate(FILL_TWICE) == [255, 0, 0, 255]
+
+
+def test_a_key_that_is_released_while_the_command_key_is_held_does_not_move_the_view_on(desktop):
+    # macOS reports no release of w here
+    keyboard = desktop.page.keyboard
+    keyboard.down("w")
+    desktop.until(lambda: desktop.server.looks[-1]["moving"], 20)
+    keyboard.down("Meta")
+    keyboard.up("Meta")
+    desktop.until(lambda: not desktop.server.looks[-1]["moving"], 20)

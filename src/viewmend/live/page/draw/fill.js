@@ -72,7 +72,8 @@ export class HoleFill {
     const { gl } = this;
     const stride = Math.max(STEP_PX, Math.round((STEP_PX * viewport[3]) / TALL_PX));
     const [x, y, width, height] = computeRectangle(bounds, viewer, viewport, stride * TAPS);
-    if (width < 1 || height < 1) return;
+    const isEmpty = !(width >= 1 && height >= 1); // NaN where the page has no height, as in a folded iframe
+    if (isEmpty) return;
 
     // copy what is drawn
     gl.activeTexture(gl.TEXTURE0);
