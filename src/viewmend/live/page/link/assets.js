@@ -11,8 +11,8 @@ import { dot, sub, unit } from "../view/matrix.js";
  * @property {number} time its index
  * @property {Shape | null} shape
  * @property {Map<number, CameraImage>} images by the camera's number
- * @property {Set<number | "mesh">} extras numbers of the completed views that were requested, also those that the
- *   server no longer has; "mesh" for its fused mesh
+ * @property {Set<number | "mesh">} extras numbers of the completed views that were requested, also those that
+ *   the server no longer has; "mesh" for its fused mesh
  * @property {Frame | null} fused the same frame with the mesh that the server fused from predicted depth
  * @property {number} requestedAt ms
  * @property {boolean} failed whether a request failed a short time ago

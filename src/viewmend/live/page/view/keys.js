@@ -48,7 +48,8 @@ export class Keys {
     this.held = new Set();
     this.shift = false;
     window.addEventListener("keydown", (event) => {
-      if (event.metaKey) this.held.clear(); // macOS does not report the release of other keys while it is held
+      // macOS does not report the release of other keys while the Command key is held
+      if (event.metaKey) this.held.clear();
       if (event.altKey || event.ctrlKey || event.metaKey || document.querySelector("dialog[open]")) return;
       if (isUsedByControl(event)) return;
       this.shift = event.shiftKey;
