@@ -125,6 +125,27 @@ def test_a_folder_without_footage_is_said(tmp_path, capsys):
     assert "expected two or more videos" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("tilt_rad", "determined"), [(0.0, False), (0.3, True)])
+def test_a_board_that_is_hardly_tilted_determines_no_focal_length(rng, tilt_rad, determined):
+    board = parse_board(SMALL_BOARD, DICTIONARY)
+    K, seen = np.array([[400.0, 0, 160], [0, 400.0, 192], [0, 0, 1]]), {}
+    for time in range(8):
+        turn = tilt_rad * np.array([np.cos(time), np.sin(time), 0])
+        for view in (0, 1):
+            shift = np.array([0.3 * view - 0.4, -0.3, 3 + 0.1 * time])
+            pixels = cv2.projectPoints(board.corners_m, turn, shift, K, np.zeros(5))[0][:, 0]
+            noise = 0.1 * torch.randn(pixels.shape, generator=rng).numpy()
+            seen[view, time] = Corners(np.arange(len(pixels)), pixels + noise)
+    if determined:
+        found = calibrate(seen, board, ("a", "b"), [(320, 384)] * 2)
+        assert all(abs(camera.K[0, 0] - 400) < 10 for camera in found)
+        return
+    with pytest.raises(
+        ValueError, match=r"camera '[ab]': .* focal length, got it to within .* tilted to all"
+    ):
+        calibrate(seen, board, ("a", "b"), [(320, 384)] * 2)
+
+
 def test_cameras_that_never_share_a_time_are_named():
     board = parse_board(SMALL_BOARD, DICTIONARY)
     K, seen = np.array([[400.0, 0, 160], [0, 400.0, 192], [0, 0, 1]]), {}

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.optimize import least_squares
-from scipy.sparse import lil_matrix
+from scipy.sparse import csr_array, csr_matrix, diags, identity, lil_matrix
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from viewmend.data.native_format import NativeCalibration, NativeCamera
@@ -37,6 +38,12 @@ CENTRE_PX = 0.05
 """Standard deviation of the principal point from the middle of the image, as a fraction of its
 size: a weak prior."""
 STEPS = 60
+TINY = 1e-10
+"""Added to the diagonal of a scaled normal matrix, so that it can be inverted."""
+MAD_TO_DEVIATION = 1.4826
+"""Standard deviation of normally distributed numbers, in medians of their absolute values."""
+MAX_FOCAL_DEVIATION = 0.05
+"""A focal length is determined if its standard deviation is at most this share of it."""
 
 Detections = Mapping[tuple[int, int], Corners]
 """Corners by index of the camera and of the frame."""
@@ -75,7 +82,7 @@ def calibrate(
 ) -> list[CalibratedCamera]:
     """Calibrate the cameras of these names and image sizes (width, height) from their views of the board.
 
-    ValueError if a camera saw the board too seldom, or never together with the others.
+    ValueError if a camera saw the board too seldom, never together with the others, or not tilted enough.
     """
     intrinsics = [
         _calibrate_alone(detections, board, view, name, sizes[view]) for view, name in enumerate(names)
@@ -100,6 +107,14 @@ def calibrate(
         f_scale=OUTLIER_PX,
         max_nfev=STEPS,
     )
+    deviations = problem.focal_deviations(found.x, found.jac)
+    worst = int(np.argmax(deviations))
+    if not deviations[worst] <= MAX_FOCAL_DEVIATION:
+        raise ValueError(
+            f"camera '{names[worst]}': expected images that determine its focal length, got it to within "
+            f"{100 * deviations[worst]:.0f} % only, as the board is hardly tilted or moved; film it at several "
+            "distances, tilted to all sides"
+        )
     return problem.cameras(found.x)
 
 
@@ -207,6 +222,20 @@ class _Residuals:
             views = np.arange(self.views)
             sparsity[2 * (corners + views) + axis, CAMERA_PARAMETERS * views + 2 + axis] = 1
         return sparsity
+
+    def focal_deviations(
+        self, x: Float64[np.ndarray, "parameter"], jacobian: csr_array | csr_matrix
+    ) -> Float64[np.ndarray, "view"]:
+        """Standard deviation of each fx, relative to it, by the spread of the corners and the Jacobian."""
+        normal = (jacobian.T @ jacobian).tocsc()
+        scale = 1 / np.sqrt(np.maximum(normal.diagonal(), TINY))  # the first camera's pose has no residuals
+        scaled = diags(scale) @ normal @ diags(scale) + TINY * identity(len(scale))
+        focal = CAMERA_PARAMETERS * np.arange(self.views)
+        units = np.zeros((len(scale), self.views))
+        units[focal, np.arange(self.views)] = scale[focal]
+        variance = (units * splu(scaled.tocsc()).solve(units)).sum(0)
+        spread_px = MAD_TO_DEVIATION * np.median(np.abs(self.residuals(x)[: self.pixels.size]))
+        return spread_px * np.sqrt(np.maximum(variance, 0)) / np.abs(x[focal])
 
     def cameras(self, x: Float64[np.ndarray, "parameter"]) -> list[CalibratedCamera]:
         """The cameras for these parameters."""
