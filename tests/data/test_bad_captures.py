@@ -166,7 +166,7 @@ BAD = {
     ),
     "mask size": (
         picture("masks/b_000.png", of_pixels(16, 20)),
-        ["masks/b_000.png", B, "'000'", "got 20 x 16"],
+        ["masks/b_000.png", B, "'000'", "40 x 32 pixels as its image", "got 20 x 16; make it"],
     ),
     "mask of 16 bit": (
         picture("masks/b_000.png", np.arange(32 * 40, dtype=np.uint16).reshape(32, 40)),

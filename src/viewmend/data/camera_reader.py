@@ -170,7 +170,10 @@ class CameraReader:
             raise CaptureError(
                 f"{where}: expected {expected}, got {got} (neither file says how); turn the mask"
             )
-        self._check_size(mask, where)
+        if mask.shape != (self.camera.height, self.camera.width):
+            expected = f"a mask of {self.camera.width} x {self.camera.height} pixels as its image"
+            got = f"{mask.shape[1]} x {mask.shape[0]}"
+            raise CaptureError(f"{where}: expected {expected}, got {got}; make it of the image's size")
 
     def _check_size(self, image: np.ndarray, where: str, rotation: Orientation | None = None) -> None:
         height, width = image.shape[:2]
