@@ -187,6 +187,21 @@ def test_a_camera_may_have_its_film_in_a_folder_of_its_own(tmp_path):
         open_capture(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["{:06d}.png", "{:04d}.png", "mask_{:05d}.png"])
+def test_masks_of_films_may_be_numbered_from_1(tmp_path, name):
+    rig = rig_of(3)
+    write_calibration(tmp_path, rig, EASYMOCAP)
+    for camera in rig:
+        write_film(tmp_path / f"videos/{camera['name']}.mp4", [picture(n) for n in range(3)])
+        (tmp_path / "masks" / camera["name"]).mkdir(parents=True)
+        for number in (1, 2, 3):
+            mask = np.full(picture(0).shape[:2], 250 + number, np.uint8)
+            cv2.imwrite(str(tmp_path / "masks" / camera["name"] / name.format(number)), mask)
+    capture = open_capture(tmp_path)
+    assert len(capture.frame_ids) == 3 and not capture.gaps
+    assert [int(capture.read(time).mask.max()) for time in range(3)] == [251, 252, 253]
+
+
 @pytest.mark.parametrize("names", ["{}/GX0{}0042.MP4", "{}_GX0{}0042.MP4"])
 def test_several_films_of_a_camera_are_named(tmp_path, names):
     rig = rig_of(3)

@@ -433,7 +433,16 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         if is_video(mask_path):
             tracks.append(video_track(name, "masks", folder / mask_path))
     clock = match_tracks(tracks)
-    return Footage(tuple(f"{time:06d}" for time in range(clock.end)), clock.fps, entries)
+    numbered = {*ids.values(), *(own for _, own in masks.values() if own)}
+    return Footage(_frames_of_videos(clock.end, numbered), clock.fps, entries)
+
+
+def _frames_of_videos(count: int, numbered: set[frozenset[str]]) -> tuple[str, ...]:
+    """The frame ids of videos: those of numbered images or masks if there is one for each frame, else from 0 on."""
+    if [len(ids) for ids in numbered] == [count]:
+        (shared,) = numbered
+        return tuple(sorted(shared, key=frame_order))
+    return tuple(f"{time:06d}" for time in range(count))
 
 
 def _without_images(folder: Path, name: str, path: str) -> str:
