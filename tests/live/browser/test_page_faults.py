@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from live.browser import scene
 from live.browser.conftest import opened
 
 pytestmark = pytest.mark.slow
@@ -203,3 +204,34 @@ def test_a_key_that_is_released_while_the_command_key_is_held_does_not_move_the_
     keyboard.down("Meta")
     keyboard.up("Meta")
     desktop.until(lambda: not desktop.server.looks[-1]["moving"], 20)
+
+
+def test_cameras_of_an_earlier_rig_are_forgotten(desktop, monkeypatch):
+    desktop.page.locator("#cameras").get_by_role("button", name="cam03").click()
+    desktop.settle()
+    desktop.page.keyboard.press("x")
+    desktop.until(lambda: desktop.server.looks[-1]["without"] == ["cam03"], 20)
+    rig = scene.rig()
+    for camera in rig["cameras"]:
+        camera["name"] = camera["name"].replace("cam", "north")
+    count = len(desktop.server.looks)
+    monkeypatch.setattr(scene, "rig", lambda: rig)
+    desktop.server.drop()
+    looks = desktop.server.looks
+    desktop.until(lambda: len(looks) > count and looks[-1]["without"] == [], 20)
+    assert desktop.page.locator("#input-row").is_hidden()
+    desktop.until(lambda: "without" not in desktop.page.url, 20)
+    desktop.errors.clear()  # the score of cam03, which was requested before the new rig arrived
+
+
+def test_a_link_to_a_frame_of_an_earlier_live_run_does_not_pause_at_a_later_one(browser, server, monkeypatch):
+    state = server._state
+    live = {"kind": "live", "total": None, "loops": False, "end": 5}
+    monkeypatch.setattr(server, "_state", lambda viewer: state(viewer) | live)
+    server.playing = True
+    with opened(browser, server, query="?sharp=0&time=20") as view:
+        for end in (5, 25):
+            live["end"] = end
+            view.until(f"document.querySelector('#seek').max === '{end - 1}'", 60)
+        view.page.wait_for_timeout(300)
+        assert not server.clocks

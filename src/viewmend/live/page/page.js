@@ -234,6 +234,7 @@ class Page {
 
   /** @param {any} rig the message */
   setRig(rig) {
+    this.#forgetOtherCameras(rig.cameras);
     byId("source").textContent = rig.name;
     if (this.source.live) document.title = `${rig.name} · viewmend live`;
     this.motion.setRig(rig);
@@ -241,6 +242,15 @@ class Page {
     this.assets.open(rig);
     this.showSources([], undefined);
     this.wake();
+  }
+
+  /** Forget what refers to cameras of an earlier rig. @param {any[]} cameras */
+  #forgetOtherCameras(cameras) {
+    const names = cameras.map(({ name }) => name);
+    const excluded = this.settings.excludedCameras.filter((name) => names.includes(name));
+    this.settings.set("without", excluded.join(","));
+    const isSameRig = JSON.stringify(cameras) === JSON.stringify(this.motion.rig?.cameras);
+    if (!isSameRig) this.snapped = null;
   }
 
   /**

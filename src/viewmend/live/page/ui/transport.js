@@ -205,6 +205,10 @@ export class Transport {
     this.state = state;
     const recording = state.kind === "recording";
 
+    // frames of a live rig that do not exist yet belong to an earlier run of the server
+    const hasFrames = state.end > state.first;
+    if (state.kind === "live" && hasFrames && this.initialFrame >= state.end) this.initialFrame = -1;
+
     // pause at the initial frame as soon as it is available
     const lastFrame = (state.total ?? Infinity) - 1;
     if (this.initialFrame >= 0 && state.end > Math.min(this.initialFrame, lastFrame)) {
