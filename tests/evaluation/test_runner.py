@@ -18,7 +18,7 @@ from viewmend.contrib.ray import cluster
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.result_cache import CellStore, cell_keys
 from viewmend.evaluation.runner import run_evaluation
-from viewmend.evaluation.scene_run import RunSettings
+from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scores import Scorers
 from viewmend.models.classical import Telea
 from viewmend.rendering.view import RenderConfig
@@ -220,6 +220,29 @@ def test_other_settings_are_other_cells(small_scenes):
         assert cell_keys(small_scenes[0], {"telea": "x"}, RunSettings(**other)) != usual
     assert cell_keys(small_scenes[0], {"telea": "y"}, RunSettings()) != usual
     assert cell_keys(replace(small_scenes[0], held="cam03"), {"telea": "x"}, RunSettings()) != usual
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        RunSettings(stream=StreamConfig(geometry="fused")),
+        RunSettings(protocol="predicted-mask"),
+        RunSettings(stream=StreamConfig(render=RenderConfig(error_rule="predicted"))),
+    ],
+)
+def test_another_model_that_predicts_depth_masks_or_errors_makes_other_cells(
+    settings, small_scenes, tmp_path, monkeypatch
+):
+    """Views of all methods depend on it, so cells of an earlier version of its weights are not used."""
+    done = SceneRun(small_scenes[0].name, (MethodRun("unfilled"),))
+    monkeypatch.setattr("viewmend.evaluation.runner.evaluate_scene", lambda *_: done)
+    keys = []
+    for weight in (1, 1, 2):
+        model = SimpleNamespace(weight=weight)
+        monkeypatch.setattr("viewmend.evaluation.result_cache.error_model_for", lambda *_, model=model: model)
+        (cell,) = run(small_scenes[:1], tmp_path, ("unfilled",), settings=settings).values()
+        keys.append(cell.key)
+    assert keys[0] == keys[1] != keys[2]
 
 
 def test_an_edited_error_rule_makes_other_cells(small_scenes, tmp_path):

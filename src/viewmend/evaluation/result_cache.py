@@ -19,7 +19,8 @@ from viewmend.data.images import read_rgb, write_image
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import RunSettings, SceneRun
 from viewmend.evaluation.scores import FEATURES, KINDS, Features, ViewScores
-from viewmend.models.registry import identity, make_method
+from viewmend.models.classical import Unfilled
+from viewmend.models.registry import error_model_for, identity, make_method
 from viewmend.rendering.error_mask import error_rule
 from viewmend.scenes.held_out import LeaveOneOutScene
 from viewmend.utils.atomic_writes import write_atomically, write_text
@@ -163,13 +164,14 @@ class CellStore:
 
 
 def cell_keys(
-    scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings
+    scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings, shared_model: str = ""
 ) -> tuple[CellKey, ...]:
-    """The keys of one scene's cells, for methods by name and their identities."""
+    """The keys of one scene's cells, for methods by name and their identities, and `shared_model_identity`."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
     rules += [value for value in (settings.background, settings.protocol) if value not in ("black", "strict")]
     # A user's rule has a module whose name contains the hash of its file
     rules += [error_rule(settings.stream.render.error_rule or "holes").__module__]
+    rules += [shared_model] if shared_model else []
     scene_digest = _digest([*rules, *settings.networks])
     of_methods = [settings.precision]
     if settings.top_k is not None:
@@ -196,6 +198,15 @@ def method_identities(names: tuple[str, ...], settings: RunSettings) -> dict[str
                 "these in variables of the module"
             ) from None
     return found
+
+
+def shared_model_identity(settings: RunSettings) -> str:
+    """`identity` of the model that predicts depth, masks or errors for all methods; "" if the settings need none."""
+    config = settings.stream
+    needed = (config.geometry, settings.protocol, config.render.error_rule)
+    if not {"fused", "predicted-mask", "predicted"} & set(needed):
+        return ""
+    return identity(error_model_for(Unfilled(), settings.device, settings.precision))
 
 
 def to_cells(

@@ -12,7 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 
 from viewmend.evaluation.provenance import provenance
-from viewmend.evaluation.result_cache import Cell, CellStore, cell_keys, method_identities, to_cells
+from viewmend.evaluation.result_cache import (
+    Cell,
+    CellStore,
+    cell_keys,
+    method_identities,
+    shared_model_identity,
+    to_cells,
+)
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
 from viewmend.models.base import Inpainter
 from viewmend.scenes.held_out import LeaveOneOutScene
@@ -62,7 +69,8 @@ def run_evaluation(
     settings = settings or RunSettings()
     _check([scene.name for scene in scenes], jobs)
     identities = method_identities(methods, settings)
-    keys = {scene.name: cell_keys(scene, identities, settings) for scene in scenes}
+    shared_model = shared_model_identity(settings)
+    keys = {scene.name: cell_keys(scene, identities, settings, shared_model) for scene in scenes}
     tasks = []
     for scene in scenes:
         cells = {key.method: store.load(key) for key in keys[scene.name]}
