@@ -108,6 +108,16 @@ def test_holes_visible_only_in_the_past_have_their_own_mean(make_cell, make_fram
     assert scores.mean("hole_fraction", "only_past") == pytest.approx((1 + 0.05) / 2)
 
 
+def test_scenes_that_do_not_tell_what_shows_a_hole_do_not_lower_the_share_of_the_past(make_cell, make_frame):
+    cells = [
+        make_cell("s", "telea", "P-turn", [make_frame(psnr_past=20.0, past_px=30)]),
+        make_cell("t", "telea", "P", [make_frame()]),
+    ]
+    overall, turning, plain = (table.rows[0].scores for table in tables(cells, ("telea",)))
+    assert plain.mean("hole_fraction", "only_past") is None
+    assert overall.mean("hole_fraction", "only_past") == turning.mean("hole_fraction", "only_past") == 0.5
+
+
 def test_holes_are_counted_by_what_shows_them(make_cell, make_frame):
     frame = make_frame(hole_px=100, hole_fg_px=90, sources_px=20, others_px=50, past_px=30, only_past_px=10)
     scores = records([make_cell("s", "telea", "R48", [frame])])

@@ -195,7 +195,8 @@ def _records_of_cell(cell: Cell) -> Iterator[Record]:
     }
     figures["hole_fraction", "hull"] = mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in cell.frames)
     figures["hole_fraction", "image"] = mean(f.hole_px / f.image_px for f in cell.frames)
-    figures["hole_fraction", "only_past"] = mean(f.past_px / f.hole_fg_px for f in inside)
+    if _origins_are_known(cell.frames):
+        figures["hole_fraction", "only_past"] = mean(f.past_px / f.hole_fg_px for f in inside)
     for kind, count in _composition(holes).items():
         figures["share_of_holes", kind] = count
     for (metric, region), value in figures.items():
@@ -205,7 +206,7 @@ def _records_of_cell(cell: Cell) -> Iterator[Record]:
 
 def _composition(frames: Sequence[ViewScores]) -> dict[str, float | None]:
     """What the holes are made of: mean fractions over the frames; nothing if it is not known."""
-    if not any(f.sources_px or f.others_px or f.past_px for f in frames):
+    if not _origins_are_known(frames):
         return {}
     counts = {
         "phantom": lambda f: f.hole_px - f.hole_fg_px,
@@ -215,6 +216,11 @@ def _composition(frames: Sequence[ViewScores]) -> dict[str, float | None]:
         "sources_past": lambda f: f.past_px,
     }
     return {kind: mean(count(f) / f.hole_px for f in frames) for kind, count in counts.items()}
+
+
+def _origins_are_known(frames: Sequence[ViewScores]) -> bool:
+    """Whether the scene says what shows the surface in its holes."""
+    return any(f.sources_px or f.others_px or f.past_px for f in frames)
 
 
 def _metric_and_region(name: str) -> tuple[str, str]:
