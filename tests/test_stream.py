@@ -320,6 +320,29 @@ def test_a_step_may_round_and_return_any_floats(dtype):
     assert draw_mode(completed, "confidence", "ff0000").any(), "NumPy has no bfloat16"
 
 
+class Learnt(Inpainter):
+    """Its colour has a gradient, and it marks all of the view as missing before it looks at it."""
+
+    def __init__(self):
+        self.colour = torch.nn.Parameter(torch.tensor(0.5))
+
+    def step(self, view, context, state):
+        """Its colour in what is missing."""
+        prepared = replace(view, error=torch.ones_like(view.error), mask=torch.ones_like(view.mask))
+        return CompletedView(prepared, torch.lerp(view.rgb, self.colour, view.error)), state
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_step_may_change_its_copy_of_the_view_and_need_not_stop_gradients(background):
+    """Holes, and what is scored in them, are the renderer's; the past of a viewer is not kept by gradients."""
+    stream = Stream(Learnt(), replace(CONFIG, background=background))
+    stream.add_frame(photograph(SPARSE))
+    made, rendered = stream.view(A).completed, stream.render(A)
+    assert bool(rendered.holes.any()) and torch.equal(made.view.holes, rendered.holes)
+    assert torch.equal(made.view.error, rendered.error) and torch.equal(made.view.rgb, rendered.rgb)
+    assert not made.rgb.requires_grad
+
+
 def test_a_state_may_be_empty():
     @dataclass(frozen=True)
     class Seen(State):

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -523,7 +524,7 @@ class Stream:
         completed = CompletedView(masked, masked.cut_rgb)
         state = self.viewer() if viewer is None else viewer
         if quality.mend:
-            with all_threads():
+            with all_threads(), torch.no_grad():  # a network of the user's may have parameters with gradients
                 completed, state = self.inpainter.step_on(self.config.background, masked, context, state)
         encoding_ms += context.encoding_ms
         inpainting_ms = ms_since(start, masked.rgb.device) - encoding_ms if quality.mend else 0.0

@@ -286,6 +286,7 @@ class Inpainter:
         """Run `step` on a view on black; the inpainter gets it on this background, and its result is on black.
 
         The completed view is cut by `view.target_mask`, if there is one, and its images are cast to float32.
+        It is of `view` itself, even if `step` returns one of a changed copy.
 
         Args:
             background: ignored if the inpainter has its own, which it then applies itself.
@@ -307,8 +308,8 @@ class Inpainter:
             )
         completed, state = made
         images: dict[str, Any] = {name: image.float() for name, image in completed.images.items()}
-        completed = replace(completed, **images)
-        return cut(from_background(given, completed, view)), state
+        completed = from_background(given, replace(completed, **images), view)
+        return cut(replace(completed, view=view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """Pixels of margin around the subject with which a crop gives the same result as the whole view.
