@@ -86,6 +86,18 @@ def test_holes_do_not_depend_on_the_error_rule(case):
     assert score_view(replace(completed, view=everything), truth, SSIM) == score_view(*case, SSIM)
 
 
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_colours_beyond_the_range_are_scored_as_they_are_shown(case, background):
+    """Networks may overshoot 0 and 1; image files do not."""
+    completed, truth = case
+    beyond = completed.rgb + torch.linspace(-0.9, 0.8, WIDTH)
+    scored, shown = (
+        score_view(replace(completed, rgb=rgb), truth, Scorers(background))
+        for rgb in (beyond, beyond.clamp(0, 1))
+    )
+    assert scored == shown
+
+
 def test_ssim_of_each_reading(case):
     completed, truth = case
     scores = score_view(completed, truth, SSIM)
@@ -122,7 +134,7 @@ def test_scores_of_networks_are_read_from_their_maps(case):
 @pytest.fixture
 def moving(rng):
     """Two frames of a texture that moves 3 pixels right and 1 down, and the backward flow."""
-    texture = torch.rand(3, HEIGHT + 1, WIDTH + 3, generator=rng)
+    texture = 0.8 * torch.rand(3, HEIGHT + 1, WIDTH + 3, generator=rng)
     before, now = texture[:, 1:, 3:], texture[:, :-1, :-3]
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     source = torch.stack([x - 3, y - 1], -1)
@@ -153,10 +165,10 @@ def test_flicker_is_error_that_does_not_move_with_the_surface(case, moving):
 def test_change_where_the_truth_is_still(case):
     completed, truth = case
     still = torch.zeros(3, HEIGHT, WIDTH)
-    still[:, :, : WIDTH // 2] = 0.5
+    still[:, :, : WIDTH // 2] = 0.1
     then, now = truth.rgb, replace(truth, rgb=truth.rgb + still)
     previous = PreviousView(completed.rgb, then)
-    for added, expected in ((0.2, 0.2), (still, 0.0)):
+    for added, expected in ((0.1, 0.1), (still, 0.0)):
         scores = score_view(replace(completed, rgb=completed.rgb + added), now, SSIM, previous)
         assert scores.change_still == pytest.approx(expected, abs=1e-6)
     assert score_view(completed, truth, SSIM).change_still is None

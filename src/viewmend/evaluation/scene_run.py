@@ -216,7 +216,7 @@ class _MethodStream:
         completed = made.completed
         previous = None
         _check(completed)
-        rgb = composite(self._settings.background, completed.rgb, completed.opacity)
+        rgb = composite(self._settings.background, completed.rgb, completed.opacity).clamp(0, 1)
         if frame.previous is not None and self._previous is not None:
             previous = PreviousView(self._previous, frame.previous.truth.rgb)
         self._scores.append(score_view(completed, frame.truth, self._scorers, previous))

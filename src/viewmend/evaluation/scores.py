@@ -197,8 +197,8 @@ def score_view(
     """All scores of one completed view; the temporal ones need the previous frame."""
     view = completed.view
     background = scorers.background
-    rgb = composite(background, completed.rgb, completed.opacity)
-    rendered = composite(background, view.cut_rgb, view.silhouette)
+    rgb = composite(background, completed.rgb, completed.opacity).clamp(0, 1)  # as it is shown
+    rendered = composite(background, view.cut_rgb, view.silhouette).clamp(0, 1)
     hull = view.mask > 0.5
     holes = view.holes
     height, width = holes.shape
