@@ -127,6 +127,22 @@ def test_masks_of_all_kinds_are_equal(plain):
         assert torch.equal(open_capture(plain.path).read(0).mask[0], torch.from_numpy(soft)), file
 
 
+def test_alpha_keeps_its_levels_where_masks_in_files_are_labels(plain):
+    soft = cv2.GaussianBlur(plain.get("masks/a_000.png"), (5, 5), 0)
+    plain.put("images/alpha.png", np.dstack([plain.get("images/a_000.png"), soft]))
+    update(plain, image="images/alpha.png", mask_labels=True)
+    capture = open_capture(plain.path, masks="alpha")
+    assert torch.equal(capture.read(0).mask[0], torch.from_numpy(soft))
+
+
+def test_no_alpha_is_read_outside_of_the_folder(plain):
+    cv2.imwrite(str(plain.path.parent / "outside.png"), plain.get("images/a_000.png"))
+    plain.edit(lambda content: content.update(frames=["../../outside"]))
+    update(plain, image="images/{frame}.png")
+    with pytest.raises(CaptureError, match="expected a file inside the folder"):
+        open_capture(plain.path, masks="alpha")
+
+
 def test_jpeg_masks_and_exif_rotation(plain):
     mask = plain.get("masks/a_000.png")
     plain.put("masks/a.jpg", mask)

@@ -356,9 +356,9 @@ def test_frames_that_were_lost_on_the_way_are_found(moving, tmp_path, monkeypatc
 # EXIF orientation.
 
 
-def to_jpeg(folder, orientation, crop=96):
-    """Replace the images of camera 3 by JPEGs with this EXIF orientation."""
-    name = names_of(folder)[3]
+def to_jpeg(folder, orientation, crop=96, view=3):
+    """Replace the images of a camera by JPEGs with this EXIF orientation."""
+    name = names_of(folder)[view]
     for path in folder.glob(f"image/{name}/*.png"):
         _, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
         tiff = (
@@ -369,7 +369,7 @@ def to_jpeg(folder, orientation, crop=96):
         head = b"\xff\xd8\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff
         path.with_suffix(".jpg").write_bytes(head + data.tobytes()[2:])
     edit_description(
-        folder, lambda content: content["cameras"][3].update(image=f"image/{name}/{{frame}}.jpg")
+        folder, lambda content: content["cameras"][view].update(image=f"image/{name}/{{frame}}.jpg")
     )
 
 
@@ -386,6 +386,17 @@ def test_exif_rotation_is_reported_once(folder, caplog, orientation, words):
         and f"'{names_of(folder)[3]}'" in found[0]
         and "exiftran" in found[0]
     )
+
+
+def test_each_exif_rotation_is_reported_with_its_own_cameras(folder, caplog):
+    to_jpeg(folder, 3, view=3)
+    to_jpeg(folder, 2, view=1)
+    open_capture(folder).read(0)
+    names = names_of(folder)
+    found = [text for text in caplog.messages if "EXIF" in text]
+    assert len(found) == 2
+    for words, view in (("turned by 180 degrees", 3), ("mirrored", 1)):
+        assert [f"(cameras '{names[view]}')" in text for text in found if words in text] == [True]
 
 
 def test_exif_rotation_explains_a_wrong_size(folder):

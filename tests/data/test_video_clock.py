@@ -9,6 +9,7 @@ from reference.films import write_film, write_film_capture
 
 from viewmend.cli import main
 from viewmend.data.capture_folder import open_capture
+from viewmend.data.errors import CaptureError
 from viewmend.data.native_writer import write_capture
 from viewmend.data.video_clock import ABSENT, Track, match_tracks
 
@@ -165,6 +166,17 @@ def test_a_capture_is_read_by_the_times_of_its_films(ball, caplog):
         assert ("c1" in seen) == (time not in (3, 4)) and ("c2" in seen) == (time % 2 == 0)
     assert capture.gaps[:2] == (("c1", "003"), ("c1", "004"))
     assert "camera 'c1' lack 2 frames from 0.30 s on" in caplog.text and "5 frames per second" in caplog.text
+
+
+def test_films_of_cameras_that_are_not_selected_do_not_count(ball):
+    rewrite(ball, "c2", range(0, 8, 2), fps=5)
+    rewrite(ball, "c3", range(0, 8, 2), fps=5)
+    assert len(open_capture(ball[0]).frame_ids) == 4
+    assert [set(seen.values()) for seen in shown(open_capture(ball[0], NAMES[:2]))] == [{n} for n in range(8)]
+    (ball[0] / "video/c3.mp4").write_bytes(b"damaged")
+    with pytest.raises(CaptureError, match="camera 'c3': expected a video"):
+        open_capture(ball[0])
+    assert len(open_capture(ball[0], NAMES[:2]).frame_ids) == 8
 
 
 def test_masks_may_be_numbered_like_the_frames_of_their_film(ball):

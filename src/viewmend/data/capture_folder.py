@@ -98,9 +98,9 @@ class CaptureFolder:
     those of `open_capture`, which logs `issues`.
 
     Raises:
-        CaptureError: one of these: `cameras.json` is invalid; a camera name is unknown; a camera lacks
-            one of its files in every frame, or all cameras do in some frame; only some cameras have depth;
-            only one camera has masks; a file lies outside the folder.
+        CaptureError: one of these: `cameras.json` is invalid; a camera name is unknown; some camera never
+            has all of its files in one frame; in some frame, no camera has all of its files; only some
+            cameras have depth; only one camera has masks; a file lies outside the folder.
     """
 
     def __init__(
@@ -123,9 +123,11 @@ class CaptureFolder:
         self._native_cameras = tuple(camera for camera in selected if camera.name not in self.unmasked)
         """The cameras in use, before undistortion."""
         self.cameras = pinhole_cameras(self._native_cameras)
-        self.clock = read_clock(calibration)
+        self.clock = read_clock(replace(calibration, cameras=self._native_cameras))
         """When the frames were taken; None for a capture of images without offsets (see `read_clock`)."""
         self._num_listed = len(calibration.frames)
+
+        # The frame ids name the times of the clock in order; ids beyond its last time are not used
         num_frames = self._num_listed if self.clock is None else len(self.clock.times_s)
         self.frame_ids = calibration.frames[:num_frames]
         self.fps = calibration.fps
@@ -232,16 +234,18 @@ class CaptureFolder:
         return replace(frame, mask=converted.mask)
 
     def _warn_about_rotation(self) -> None:
-        """Log once that images are used as stored, and for which cameras EXIF says that they should be rotated."""
-        rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
-        if rotated:
-            names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
+        """Log that images are used as stored although EXIF rotates them, once per camera; one message per rotation."""
+        cameras: dict[str, list[str]] = {}
+        for reader in self._readers:
+            if reader.rotation and not reader.warned:
+                cameras.setdefault(str(reader.rotation), []).append(f"'{reader.camera.name}'")
+                reader.warned = True
+        for rotation, names in cameras.items():
             logging.getLogger("viewmend").warning(
-                f"{self.name}: EXIF says that images should be {rotated[0].rotation}, but pixels are used as stored "
-                f"(cameras {names}); if calibration and masks are upright, make the images upright too (exiftran -ai)"
+                f"{self.name}: EXIF says that images should be {rotation}, but pixels are used as stored "
+                f"(cameras {', '.join(names)}); if calibration and masks are upright, make the images upright too "
+                "(exiftran -ai)"
             )
-        for reader in rotated:
-            reader.warned = True
 
     def _cameras_have(self, kind: FileKind) -> bool:
         """Whether the cameras have files of this kind; CaptureError if some have and others do not."""
@@ -364,12 +368,12 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
     if camera.image is None:
         where = f"{folder}: camera '{camera.name}'"
         raise CaptureError(f"{where}: expected images with alpha, got a video; use another source of masks")
-    files = [folder / camera.file("image", frame) for frame in frames]
-    existing = [file for file in files if file.is_file()]
+    paths = [camera.file("image", frame) for frame in frames]
+    existing = [folder / path for path in paths if stays_inside(path) and (folder / path).is_file()]
     if existing and not any(uses_alpha(file) for file in existing):
         # This raises the error for the first image, which has no alpha or cannot be read
         read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")
-    return replace(camera, mask=camera.image)
+    return replace(camera, mask=camera.image, mask_labels=False)
 
 
 def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
@@ -385,7 +389,7 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 
 
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:
-    """Match the videos of a capture by time; None if it has no videos and no offsets.
+    """Match the videos of a calibration's cameras by time; None if they have no videos and no offsets.
 
     A camera's numbered images are matched like the frames of a video. Their rate is that of the capture or,
     if it has none, of the first video. CaptureError if a video cannot be decoded, no two cameras
