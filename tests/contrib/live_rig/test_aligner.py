@@ -91,6 +91,15 @@ def test_a_clock_that_jumps_takes_nobody_along():
     assert rig.counts["a"]["used"] == 10 and rig.counts["b"] == {"used": 5, "misaligned": 5, "missing": 5}
 
 
+def test_a_fast_camera_with_a_wrong_clock_does_not_set_the_first_tick():
+    rig = Aligner(("a", "b", "c"), 2 * FRAME_S, tolerance_s=0.01, wait_s=0.2)
+    assert rig.wants(1000.13, FRAME_S)
+    put(rig, "c", 1000.13, 1.0)
+    put(rig, "ab", 1.0)
+    [group] = rig.take(1.3)
+    assert times(group) == {"a": 1.0, "b": 1.0} and rig.counts["c"]["misaligned"] == 1
+
+
 def test_pictures_far_from_their_time_are_left_out():
     rig = aligner("ab", tolerance_s=0.01)
     put(rig, "a", 1.0)
@@ -130,6 +139,7 @@ def test_the_line_follows_cameras_of_another_rate():
 
 def test_a_slower_rig_takes_each_cameras_picture_at_its_ticks():
     rig = Aligner(("a", "b"), 2 * FRAME_S, FRAME_S, 0.2)
+    put(rig, "a", 0.0)
     for phase_s in (0.0, 0.02):
         assert [n for n in range(40) if rig.wants(n * FRAME_S + phase_s, FRAME_S)] == list(range(0, 40, 2))
     assert all(rig.wants(n * 0.2 + 0.05, 2 * FRAME_S) for n in range(40))

@@ -24,8 +24,8 @@ of the group's images from their tick, times this factor."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""No more than this many groups are kept, plus one for each tick within the time that a group waits for images. If
-there are more, because they are not taken, the oldest are dropped."""
+"""This many groups are kept until they are taken, besides those that may still wait for images: one for each tick
+of the waiting time. If there are more, the oldest are dropped."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,11 @@ class Aligner:
     def wants(self, taken_s: float, period_s: float) -> bool:
         """Whether an image may be used. From a fast camera, only the image nearest to each tick is used.
 
-        `period_s` is the time between two images of the camera; 0 if it is unknown.
+        `period_s` is the time between two images of the camera; 0 if it is unknown. Before `put` has set
+        tick 0, all images are wanted.
         """
-        if period_s == 0 or self._interval_s < FAST_RATIO * period_s:
+        is_fast = self._interval_s >= FAST_RATIO * period_s > 0
+        if not is_fast or self._origin_s is None:
             return True
         return abs(self._nearest(taken_s).offset_s) <= period_s / 2
 
