@@ -302,8 +302,8 @@ class ViewerConnection:
     def send_due(self, shared: SharedState) -> float:
         """Send the messages that are due, and end the connection if a frame was not acknowledged in time.
 
-        Returns when the registry has to call this again, by the service's clock. The registry calls
-        it earlier if `shared` changes or the viewer sends a message.
+        The result is a time on the service's clock: the registry has to call this again by then, or earlier
+        if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
@@ -372,10 +372,10 @@ class ViewerConnection:
         counts = self._service.ahead.counts()
         for key, count in counts.items():
             if self._sent.announced.get(key) != count:
-                index, without = key
+                frame_index, without = key
                 message = {
                     "type": "completed",
-                    "time": index,
+                    "time": frame_index,
                     "without": without,
                     "cameras": [image.camera for image in self._service.ahead.images(key)],
                     "mesh": self._service.ahead.mesh(key) is not None,
@@ -386,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # Statistics count the frames that were sent in the last second. If none was sent after `stats_s - 1`,
-        # the last message counted 0 frames, and there are still none to count.
+        # A message counts the frames of the second before it. If no frame was sent in the second before the last
+        # message, nor since, the last message said 0, and the next one would, too.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

@@ -76,7 +76,8 @@ def train(
 
     Raises:
         RunError: `out` holds a run with another config, or a damaged one.
-        ValueError: another run is writing there, or `out` holds files that no run wrote.
+        ValueError: another run is writing there; `out` holds files that no run wrote; or the number of
+            sample streams does not fit that of the processes, or the earlier part of the run.
         FloatingPointError: a loss is not finite (its samples were saved in `out`), or a weight is not
             finite (the last checkpoint was kept).
     """
@@ -361,7 +362,7 @@ class Run:
         return self.average.module
 
     def _validate(self, log: Log, step: int) -> None:
-        """Score and log the averaged weights. If the run keeps the best weights, and these are, write them."""
+        """Score and log the averaged weights. A run that keeps the best writes them if their score is the best."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         first_scores = log.first_validation() or scores

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from viewmend.contrib.live_rig.frame_times import frame_times
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.errors import CaptureError
-from viewmend.data.video_clock import Track, match_tracks
+from viewmend.data.video_clock import Track, match_tracks, own_fps
 from viewmend.data.videos import (
     VideoProperties,
     decode,
@@ -99,13 +99,15 @@ class Playback:
         clock = match_tracks(tracks)
         matched = clock.tracks
         first_s = min(float(track.times_s[0]) for track in matched)
-        ends_s = [float(track.times_s[-1]) + 1 / (track.fps or 1.0) for track in matched]
-        self.length_s = min(ends_s) - first_s
+        ends_s = [float(track.times_s[-1]) + 1 / own_fps(track) for track in matched]
         shifts_s: dict[str, float] = {}
         for original, shifted in zip(tracks, matched, strict=True):
             shift_s = float(shifted.times_s[0] - original.times_s[0])
             shifts_s[original.camera] = shift_s - first_s
-        self.shifts_s = shifts_s  # only now, because readers on other threads must not find a part of it
+
+        # Set last: readers on other threads compare both with their `Timing` before each image
+        self.length_s = min(ends_s) - first_s
+        self.shifts_s = shifts_s
         return clock.timecode_note
 
     def timing(self, name: str, first_s: float) -> Timing:

@@ -59,8 +59,8 @@ class SenderTimes(ImageTimes):
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
         """When the reader received the last `lag_packets + 1` packets, the oldest first; None for those it did not
-        wait for. As FFmpeg returns packets late, the data of the newest packet arrived when the reader
-        received the oldest of these."""
+        wait for. FFmpeg returned the oldest of these packets when the data of the newest arrived. So the
+        first of these times is when the newest packet's data arrived."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

@@ -174,7 +174,9 @@ def read_rig(path: Path, max_image_size: int | None = None, fps: float | None = 
 
 
 def _calibration(path: Path, format: str | None) -> NativeCalibration:
-    """Read the calibration that a rig names: a folder of any format, one of its files, or a file of a whole capture.
+    """Read the calibration that a rig names.
+
+    `path` is a folder of any format, one file of such a folder, or one file that holds a whole capture.
 
     Raises:
         CaptureError: there is none, or the calibration recognised in the folder is another file.

@@ -100,8 +100,8 @@ class CameraWorker:
         self.up = False
         """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why the camera delivers no images or, while it does, why an image was last refused. None if there was
-        no fault since connecting."""
+        """While `up` is False: why there are no images. While `up` is True: why an image was refused; of several,
+        the last. None if neither has happened since the camera connected."""
         self._masks = mask_maker(camera)
         self._undistortion = Undistortion(camera.calibration)
         colour = camera.calibration.colour

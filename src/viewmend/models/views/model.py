@@ -73,8 +73,8 @@ Image = Float[Tensor, "3 height width"]
 IMAGE_CHANNELS = 7
 """`ViewImage` has this many channels."""
 CHOOSING_SAMPLES = tuple(OFFSETS.index(offset) for offset in (0.0, 0.053, 0.19))
-"""Indices of the samples by which the cameras of a ray are chosen: those that see these samples best. The
-samples are on the proxy, and 0.053 and 0.19 subject sizes behind it (`OFFSETS`)."""
+"""Indices of three samples of a ray: on the proxy, and 0.053 and 0.19 subject sizes behind it (`OFFSETS`). The
+cameras that see these three best are sampled along the whole ray."""
 CELL_CHANNELS = IMAGE_CHANNELS + 2
 """The U-Net gets this many channels of a cell, apart from its ray samples: those of `ViewImage`, the depth
 of the proxy relative to the subject's median depth, and whether the proxy or its rim covers the cell."""
@@ -240,7 +240,8 @@ class ViewSynthNet(Network):
         predicted = has_depth if where is None else where & has_depth
         image = ViewImage.of(view, filled, predicted)
 
-        # The depth distribution, in cells of `CELL_PX` pixels. Large cells are cells of the view at half its size
+        # The depth distribution, in cells of 2 x 2 pixels. For large cells, the view is halved first, so that a
+        # cell covers 4 x 4 pixels of the view itself
         large_cells = allow_large_cells and sources.magnification(view.camera, scale) >= LARGE_CELLS_FROM
         full_size = CellInputs(with_rim, predicted, image)
         inputs = halve(full_size) if large_cells else full_size
@@ -266,7 +267,8 @@ class ViewSynthNet(Network):
         """
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
-        return self.coarse(replace(view, error=view.holes.to(view.error)), sources, scale).float()
+        only_holes = replace(view, error=view.holes.to(view.error))  # `RayFill` fills where E > 0
+        return self.coarse(only_holes, sources, scale).float()
 
     def source_names(self, view: IncompleteView) -> tuple[str, ...]:
         """Names of the source cameras that are sampled for a view, the closest first."""
@@ -329,7 +331,8 @@ class ViewSynthNet(Network):
         where = view.refine_mask & (view.depth_with_rim > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # At the lowest quality, holes are filled without the cameras, if there is anything to inpaint
+        # At the lowest quality, background is attenuated, and holes are filled from the pixels around them. A view
+        # with neither is returned unchanged below
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
@@ -387,7 +390,7 @@ class ViewSynthNet(Network):
             stop_if_cancelled()
             with all_threads():
                 features = self.unet.forward_points(inputs, cells, cell_channels.to(inputs))
-            logits = self.depth_logits(features)[0, :, rows, columns].T.float() + samples.score.float()
+            logits = self.depth_logits(features)[0][:, rows, columns].T.float() + samples.score.float()
         cell_index = index_image(cells, depth.shape)
         return DepthDistribution(cells, cell_index, cell_depth.predicted, logits, samples, cameras, features)
 
@@ -486,7 +489,7 @@ class ViewSynthNet(Network):
             input_image = scatter_to_image(inputs.to(feature_image), pixels, shape)
             out = self.blending(concatenate_channels(feature_image, input_image))
         rows, columns = pixels.unbind(1)
-        return out[0, :, rows, columns].T.float()
+        return out[0][:, rows, columns].T.float()
 
 
 def depth_of_cells(view: IncompleteView, predicted: Mask) -> CellDepth:
