@@ -105,7 +105,7 @@ class Playback:
             shift_s = float(shifted.times_s[0] - original.times_s[0])
             shifts_s[original.camera] = shift_s - first_s
 
-        # Set last: readers on other threads compare both with their `Timing` before each image
+        # Readers on other threads compare both before each image, and join the others again if one has changed
         self.length_s = min(ends_s) - first_s
         self.shifts_s = shifts_s
         return clock.timecode_note
