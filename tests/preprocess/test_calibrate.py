@@ -203,13 +203,15 @@ def test_silhouettes_refine_a_studio_rig_to_a_third_of_a_pixel(tmp_path):
     assert over_the_stage_px(pinhole_cameras(read_calibration(tmp_path / "out").cameras), rig).mean() < 0.3
 
 
-def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("file", ["", "cameras.json"])
+def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch, file):
     folder, cameras = shutil.copytree(studio[0], tmp_path / "take"), studio[1]
     disturbed(folder)
     true = lambda frames, *_: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1)  # noqa: E731
     monkeypatch.setattr(cross_validation, "refine_by_silhouettes", true)
     monkeypatch.setattr(cross_validation, "best_hold", lambda *_: HOLDS[0])
-    assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]) == 0
+    source = str(folder / file)
+    assert main(["calibrate", source, str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "outlines  missed_px 0.9, refined_px 0.1" in lines and len(lines) == 4
     shutil.copy(tmp_path / "out" / "cameras.json", folder / "cameras.json")

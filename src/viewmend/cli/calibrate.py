@@ -140,8 +140,8 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
     with busy("refining all cameras"):
         refined = refine_all(frames, bounds, hold)
     out.mkdir()
-    path = options.source.parent if options.source.is_file() else options.source
-    write_calibration(out, with_cameras(read_any_calibration(path, options.format), refined.cameras))
+    unrefined = read_any_calibration(options.source, options.format)
+    write_calibration(out, with_cameras(unrefined, refined.cameras))
     held = {f"{score.camera} left out": {"iou": score.before, "refined": score.after} for score in scores}
     return {"outlines": {"missed_px": refined.before_px, "refined_px": refined.after_px}} | held
 

@@ -110,11 +110,11 @@ class CaptureFolder:
         format: str | None = None,
         masks: MaskSource = "files",
     ):
-        path = path.parent if path.name == CALIBRATION and path.is_file() else path
         calibration = read_any_calibration(path, format)
         folder = calibration.folder
         self.folder = folder
-        self.name = path.stem if path.is_file() else folder.resolve().name
+        is_file = path.is_file() and path.name != CALIBRATION
+        self.name = path.stem if is_file else folder.resolve().name
         """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
         selected = _with_masks_from(masks, _select(calibration.cameras, cameras, self._file), calibration)

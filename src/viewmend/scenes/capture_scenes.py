@@ -133,8 +133,7 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
 
 def _fingerprint(folder: Path, format: str | None) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
-    is_file = folder.name == CALIBRATION and folder.is_file()
-    plain = read_any_calibration(folder.parent if is_file else folder, format)
+    plain = read_any_calibration(folder, format)
     folder = plain.folder
     named = {
         c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames

@@ -99,7 +99,9 @@ def _as_stored(calibration: NativeCalibration) -> NativeCalibration:
 
 
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
-    """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
+    """Read the calibration of a capture, which is a folder or a file, in any supported format.
+
+    A file is one that holds or describes a whole capture, or the `cameras.json` of a capture in viewmend's own format.
 
     `format` is one of `FORMAT_NAMES`; by default the first one that matches. CaptureError if the
     format is unknown, the folder does not have it, or its calibration cannot be used.
@@ -108,6 +110,8 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
         raise CaptureError(
             f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them"
         )
+    if path.name == CALIBRATION and path.is_file():
+        path = path.parent
     native = format in (None, "plain")
     names = [name for name in FORMATS if format in (None, name)]
     if native and (path / CALIBRATION).is_file():
