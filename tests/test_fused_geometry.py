@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.ball import camera_at, photograph, ring
+from reference.ball import camera_at, photograph, photograph_at, ring
 from reference.forged import forged
 
 from viewmend.frame_cache import all_masks, cache_frame
-from viewmend.fused_geometry import fuse_geometry
+from viewmend.fused_geometry import FusedFrame, fuse_geometry
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.fusion import FusionConfig
 from viewmend.geometry.hull import HullConfig, visual_hull
 from viewmend.geometry.rasterize import rasterize
@@ -40,6 +41,32 @@ class Moved(Inpainter):
         return DepthMap((view.depth + self.metres) * inside, inside)
 
 
+class Noisy(Inpainter):
+    """Predicts the proxy's depth with noise of 3 cm, new in each view."""
+
+    predicts_depth = True
+
+    def __init__(self) -> None:
+        self.rng = torch.Generator().manual_seed(5)
+
+    def predict_depth(self, view, context):
+        inside = (view.depth > 0).float()
+        noise = 0.03 * torch.randn(view.depth.shape, generator=self.rng)
+        return DepthMap((view.depth + noise) * inside, 0.5 * inside)
+
+
+def sequence(centers, share, times=None):
+    """A ball's fused proxies, frame by frame, from noisy depth."""
+    config = replace(FUSED, fusion=replace(SMALL, last_share=share))
+    stream = Stream(Noisy(), config, Bounds(torch.full((3,), -1.0), torch.full((3,), 1.0)))
+    cameras = ring(6, 96)
+    times = range(len(centers)) if times is None else times
+    return [
+        stream.add_frame(photograph_at(center, cameras, time)).proxy
+        for center, time in zip(centers, times, strict=True)
+    ]
+
+
 @pytest.fixture(scope="module")
 def views():
     return load_inpainter("views")
@@ -69,8 +96,8 @@ def test_the_hull_follows_the_depth_that_is_predicted():
     target = camera_at(77, "novel", 96)
 
     def depth_m(model) -> float:
-        proxy = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), SMALL, HullConfig())
-        return float(proxy.depth(target)[0, 48, 48])
+        fused = fuse_geometry(cached, all_masks(frame), model, RenderConfig(), SMALL, HullConfig())
+        return float(fused.cached.proxy.depth(target)[0, 48, 48])
 
     # Views from the side move the surface that faces the target by less than the full distance.
     still_m = depth_m(Moved(0.0))
@@ -128,3 +155,48 @@ def test_the_hull_that_is_fused_has_the_streams_parameters(monkeypatch):
     config = replace(FUSED, hull=HullConfig(pixels_per_voxel=4.0))
     Stream(Moved(0.0), config).add_frame(photograph(ring(6, 96)))
     assert used == [HullConfig(pixels_per_voxel=4.0, resolution=SMALL.resolution)]
+
+
+def test_a_still_surface_flickers_less_than_its_depth():
+    target = camera_at(77, "novel", 96)
+
+    def flicker_m(share: float) -> float:
+        depth = torch.cat([proxy.depth(target) for proxy in sequence([(0.0, 0.0, 0.0)] * 5, share)])
+        shown = (depth > 0).all(0)
+        return float((depth[1:] - depth[:-1])[:, shown].abs().mean())
+
+    assert flicker_m(0.8) < 0.5 * flicker_m(0.0)
+
+
+def test_a_moving_surface_is_that_of_its_own_frame():
+    path = [(0.1 * step, 0.0, 0.0) for step in range(3)]
+    followed = sequence(path, 0.8)[-1].mesh.vertices
+    own = sequence(path, 0.0)[-1].mesh.vertices
+    center = torch.tensor(path[-1])
+    distance = (followed - center).norm(dim=1)
+    assert float(distance.max()) < float((own - center).norm(dim=1).max()) + 0.005, "a trail"
+    assert len(followed) == pytest.approx(len(own), rel=0.02)
+    assert float(distance.std()) == pytest.approx(float((own - center).norm(dim=1).std()), rel=0.1)
+
+
+@pytest.mark.parametrize("times", [(5, 4), (0, 4)])
+def test_only_a_frame_shortly_before_counts(times):
+    center = (0.0, 0.0, 0.0)
+    _, with_last = sequence([center, center], 0.8, times)
+    _, alone = sequence([center, center], 0.0, times)
+    assert torch.equal(with_last.mesh.vertices, alone.mesh.vertices)
+
+
+def test_a_frame_of_other_cameras_does_not_count():
+    first = photograph(ring(6, 96))
+    made = Stream(Moved(0.0), FUSED).add_frame(first)
+    fused = FusedFrame(
+        made, visual_hull(first.mask, first.cameras, made.proxy.bounds, HullConfig(resolution=8))
+    )
+    next_frame = replace(first, time=1)
+    assert fused.surface_for(next_frame) is not None
+    fewer = next_frame.without(["c2"])
+    moved = replace(first.cameras, K=first.cameras.K * torch.tensor([1.01, 1.0, 1.0]))
+    assert fused.surface_for(fewer) is None
+    assert fused.surface_for(replace(next_frame, cameras=moved)) is None
+    assert replace(fused, occupancy=None).surface_for(next_frame) is None

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.frame_cache import CachedFrame, DepthProvider, all_masks, cache_frame, check_provider, evict
-from viewmend.fused_geometry import fuse_geometry
+from viewmend.fused_geometry import FusedFrame, fuse_geometry
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.fusion import FusionConfig
@@ -39,7 +39,6 @@ from viewmend.types import (
     check_target_mask,
 )
 from viewmend.utils.cancellation import stop_if_cancelled
-from viewmend.utils.tensors import to_mmap
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 
 log = logging.getLogger("viewmend")
@@ -166,6 +165,8 @@ class Stream:
             )
         self._mask_model = self._find_mask_model()
         self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
+        self._fused: FusedFrame | None = None
+        """The frame whose geometry was fused last."""
         self._warned = False
         """Whether a warning has said that the memory does not hold the window."""
 
@@ -193,6 +194,7 @@ class Stream:
         config = replace(self.config, render=render)
         other = Stream(self.inpainter, config, self.bounds, self.error_model)
         other._frames = self._frames
+        other._fused = self._fused
         return other
 
     @property
@@ -246,10 +248,12 @@ class Stream:
         start = now_s(images.rgb.device)
         masks = all_masks(images, carving)
         config = self.config
-        proxy = fuse_geometry(hull, masks, self._depth_model, config.render, config.fusion, config.hull)
-        fusion_ms = ms_since(start, images.rgb.device)
-        # Encodings are dropped, because they depend on the hull's depth.
-        return CachedFrame(images, to_mmap(proxy), hull.geometry_ms + fusion_ms)
+        self._fused = fuse_geometry(
+            hull, masks, self._depth_model, config.render, config.fusion, config.hull, self._fused
+        )
+        fused = self._fused.cached
+        fused.geometry_ms = hull.geometry_ms + ms_since(start, images.rgb.device)
+        return fused
 
     def adopt(self, cached: CachedFrame) -> CachedFrame:
         """Add a frame that another stream has prepared, with its geometry and everything computed from it so far.

@@ -293,7 +293,7 @@ def test_the_geometry_may_be_fused_from_predicted_depth(folder, tmp_path, mend, 
     small = FusionConfig(resolution=96, max_views=12, view_px=96)
     monkeypatch.setattr(
         "viewmend.stream.fuse_geometry",
-        lambda *arguments: fuse_geometry(*arguments[:-2], small, arguments[-1]),
+        lambda *arguments: fuse_geometry(*arguments[:4], small, *arguments[5:]),
     )
     reports = {}
     for geometry in ("hull", "fused"):

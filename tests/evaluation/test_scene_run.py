@@ -10,6 +10,8 @@ import torch
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
+from viewmend.fused_geometry import FusedFrame
+from viewmend.geometry.fusion import FusionConfig
 from viewmend.models.base import ContextProvider, State
 from viewmend.models.checkpoint import build
 from viewmend.models.classical import Telea
@@ -18,7 +20,7 @@ from viewmend.models.paper.config import paper_small
 from viewmend.models.paper.context import window_times
 from viewmend.scenes.held_out import LeaveOneOutScene
 from viewmend.scenes.studio_scenes import lengthen, procedural_set, turning_set
-from viewmend.stream import Stream
+from viewmend.stream import Stream, StreamConfig
 
 
 @pytest.fixture
@@ -57,6 +59,23 @@ def turning() -> Precomputed:
     scene = replace(scene, config=config, held="cam00", scored_from=3)
     kind = {name: getattr(scene, name) for name in ("name", "set", "rig", "style", "held", "scored_from")}
     return Precomputed(made=list(scene.frames()), **kind)
+
+
+def test_fused_geometry_follows_the_last_frame(small_scenes, monkeypatch):
+    surfaces = []
+    find = FusedFrame.surface_for
+
+    def surface_for(last, frame):
+        surfaces.append((last.cached.frame.time, frame.time, find(last, frame)))
+        return surfaces[-1][2]
+
+    monkeypatch.setattr(FusedFrame, "surface_for", surface_for)
+    fusion = FusionConfig(resolution=32, max_views=5, view_px=48)
+    settings = RunSettings(stream=StreamConfig(geometry="fused", fusion=fusion, memory_mb=None))
+    assert evaluate_scene(small_scenes[0], ("nearest",), settings).runs[0].error is None
+    ((last, now, surface),) = surfaces
+    assert (last, now) == (0, 1)
+    assert surface is not None
 
 
 def test_a_scene_without_frames_fails(turning):

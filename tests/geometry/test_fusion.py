@@ -59,7 +59,7 @@ def carved(proxy, cameras, views, config=CONFIG):
     """The hull of a solid's masks in these cameras, and the same after fusion."""
     mask = (255 * (proxy.depth(cameras) > 0)).byte()
     hull = reconstruct(mask, cameras, BOX)
-    return hull, fuse_depth(hull, mask, cameras, views, config)
+    return hull, fuse_depth(hull, mask, cameras, views, config).proxy
 
 
 def test_both_paths_equal_the_slow_reference(fuse, rng):
@@ -174,7 +174,7 @@ def test_uncertain_depth_moves_the_hull_less_than_certain_depth():
     assert removed_m3(0.02) < 0.5 * removed_m3(1.0)
 
 
-@pytest.mark.parametrize("wrong", [{"hull_weight": 0.0}, {"smooth_below": 0.5}])
+@pytest.mark.parametrize("wrong", [{"hull_weight": 0.0}, {"smooth_below": 0.5}, {"last_share": 1.0}])
 def test_a_config_without_meaning_is_refused(wrong):
     with pytest.raises(ValueError, match="expected"):
         FusionConfig(**wrong)
@@ -185,13 +185,14 @@ def test_the_hull_is_carved_with_the_parameters_given():
     ball = proxy_of(lambda points: 0.5 - points.norm(dim=-1))
     mask = (255 * (ball.depth(cameras) > 0)).byte()
     views = true_views(ball, cameras)
-    assert len(fuse_depth(ball, mask, cameras, views, CONFIG).mesh.vertices)
+    assert len(fuse_depth(ball, mask, cameras, views, CONFIG).proxy.mesh.vertices)
     behind = replace(ABOVE[[0]], camera_from_world=ABOVE.camera_from_world[:1] @ FAR_AWAY)
     mask = torch.cat([mask, torch.zeros_like(mask[:1])])
     cameras = concatenate_cameras([cameras, behind.resized(48, 48)])
     all_must_see = HullConfig(min_fraction=1.0, least_fraction=1.0)
-    assert len(fuse_depth(ball, mask, cameras, views, CONFIG).mesh.vertices), "six of seven cameras see it"
-    assert not len(fuse_depth(ball, mask, cameras, views, CONFIG, all_must_see).mesh.vertices)
+    six_of_seven = fuse_depth(ball, mask, cameras, views, CONFIG)
+    assert len(six_of_seven.proxy.mesh.vertices), "six of seven cameras see it"
+    assert not len(fuse_depth(ball, mask, cameras, views, CONFIG, all_must_see).proxy.mesh.vertices)
 
 
 @pytest.mark.parametrize("field", ["depth", "confidence"])

@@ -234,7 +234,8 @@ def test_a_mesh_is_fused_on_another_device(monkeypatch):
         renderer = Renderer(Ball(), SmallerFill(), PIPELINE, completed_cameras=2)
         renderer._device = device
         assert renderer.prepare(0)
-        _, about, arrays = read_shape(renderer.fuse_mesh(0, ()).content)
+        renderer.fuse_mesh(0, ())
+        _, about, arrays = read_shape(renderer.fuse_mesh(1, ()).content)
         return volume_m3(about, arrays)
 
     expected = fused("cpu")

@@ -47,6 +47,14 @@ def photograph(cameras: Cameras, time: int = 0) -> MultiViewFrame:
     return MultiViewFrame(cameras, rgb, (depth > 0).byte() * 255, time, depth)
 
 
+def photograph_at(center: tuple[float, float, float], cameras: Cameras, time: int = 0) -> MultiViewFrame:
+    """`photograph`, with the ball elsewhere."""
+    shift = torch.eye(4)
+    shift[:3, 3] = torch.tensor(center)
+    seen = photograph(replace(cameras, camera_from_world=cameras.camera_from_world @ shift), time)
+    return replace(seen, cameras=cameras)
+
+
 def proxy(rows: int = 48) -> GeometryProxy:
     """The ball as a mesh of rows of latitude."""
     latitude = torch.linspace(-math.pi / 2, math.pi / 2, rows + 1)

@@ -1,4 +1,4 @@
-"""Slow, obvious reference of viewmend.geometry.fusion.fuse_occupancy: one voxel, one view at a time."""
+"""Slow, obvious reference of fusing depth and of keeping the last surface: one voxel, one view at a time."""
 
 import itertools
 
@@ -54,3 +54,48 @@ def sums_at(point, voxel_m, views, config):
                 distances.append(min(distance, config.truncation_voxels))
                 weights.append(max(float(views.confidence[view, row, column]), 1e-3))
     return np.dot(distances, weights), sum(weights), len(weights)
+
+
+def steadied_reference(fused, hull, last, share, behind_m):
+    """The occupancy averaged with the last surface's, float64."""
+    values = fused.values.double().numpy().copy()
+    for index in np.ndindex(*values.shape):
+        if hull.values[index] > 0:
+            point = fused.low.double().numpy() + (np.array(index) + 0.5) * fused.voxel_m
+            before = interpolated(last.occupancy, point)
+            values[index] += share * stillness_at(point, last, behind_m) * (before - values[index])
+            values[index] = min(values[index], float(hull.values[index]))
+    return values
+
+
+def interpolated(grid, point):
+    """The occupancy of a grid at a point, trilinear; voxels beyond the grid are 0."""
+    place = (point - grid.low.double().numpy()) / grid.voxel_m - 0.5
+    first = np.floor(place).astype(int)
+    found = 0.0
+    for step in itertools.product((0, 1), repeat=3):
+        at = first + step
+        if (at >= 0).all() and (at < grid.values.shape).all():
+            weight = np.prod(np.where(step, place - first, 1 - (place - first)))
+            found += weight * float(grid.values[tuple(at)])
+    return found
+
+
+def stillness_at(point, last, behind_m):
+    """The least stillness in the cameras that see a point; in all, if none does."""
+    seen = [1.0]
+    every = [1.0]
+    hidden = True
+    for view in range(len(last.cameras)):
+        pose = last.cameras.camera_from_world[view].double().numpy()
+        x, y, z = last.cameras.K[view].double().numpy() @ (pose[:3, :3] @ point + pose[:3, 3])
+        width, height = last.cameras.size_px[view].tolist()
+        if z > 0 and 0 <= x / z < width and 0 <= y / z < height:
+            row, column = int(y / z), int(x / z)
+            still = float(last.stillness[view, row, column])
+            surface = float(last.depth[view, row, column])
+            every.append(still)
+            if surface == 0 or z < surface + behind_m:
+                seen.append(still)
+                hidden = False
+    return min(every) if hidden else min(seen)

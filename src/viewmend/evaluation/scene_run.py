@@ -138,12 +138,14 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     last = None
     predict_mask = settings.protocol == "predicted-mask"
     render = replace(settings.stream.render, error_rule="holes")
-    config = replace(settings.stream, render=render, predict_mask=predict_mask)
+    # One frame at a time; methods keep those that they need
+    config = replace(settings.stream, render=render, predict_mask=predict_mask, memory_mb=0.0)
     model = None
     if predict_mask or config.geometry == "fused":
         model = error_model_for(Unfilled(), settings.device, settings.precision)
+    stream = Stream(Unfilled(), config, error_model=model)
     for frame in (to_device(own, settings.device) for own in scene.frames()):
-        stream = Stream(Unfilled(), config, frame.bounds, model)
+        stream.bounds = frame.bounds
         target_mask, own = reveal(settings.protocol, frame.truth)
         carving = own if frame.carving is None else frame.carving.joined(own)
         cached = stream.add_frame(frame.inputs, carving=carving)

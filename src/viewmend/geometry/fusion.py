@@ -4,7 +4,8 @@ A hull cannot be concave, and with few cameras it is too large. Depth maps are f
 and Levoy (SIGGRAPH 1996): every voxel takes the weighted mean of its signed distances to the
 surfaces that the views see. The hull counts as an additional view. So the surface stays on the hull
 where no view near it has depth, and moves less where depth is uncertain. Where all depth is uncertain,
-distances are also averaged over neighbouring voxels; otherwise the surface would be rough.
+distances are also averaged over neighbouring voxels; otherwise the surface would be rough. Where images
+do not change from frame to frame, the surface is averaged over time (`geometry/last_surface.py`).
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from torch.nn import functional as F
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.hull import HullConfig, OccupancyGrid, kernel_arrays, visual_hull
 from viewmend.geometry.hull_parts import without_floating_parts
+from viewmend.geometry.last_surface import LastSurface, continued, steadied
 from viewmend.geometry.mesh import vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.sampling import in_view
@@ -60,6 +62,9 @@ class FusionConfig:
     """Where the views' mean confidence is lower, the surface is smoothed."""
     sharp_above: float = 0.35
     """Where the views' mean confidence is higher, the surface is not smoothed."""
+    last_share: float = 0.8
+    """The share of the last frame's occupancy where no image has changed. With 0, every frame is fused on
+    its own."""
 
     def __post_init__(self) -> None:
         if not self.hull_weight > 0:
@@ -68,6 +73,8 @@ class FusionConfig:
             raise ValueError(
                 f"expected smooth_below to be less than sharp_above, got {self.smooth_below} and {self.sharp_above}"
             )
+        if not 0 <= self.last_share < 1:
+            raise ValueError(f"expected a last_share from 0 to below 1, got {self.last_share}")
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,14 @@ class DepthViews(OnDevice):
     """How certain the depth is, in [0, 1]."""
 
 
+@dataclass(frozen=True)
+class FusedSurface:
+    """A frame's fused surface, as a mesh and as voxels."""
+
+    proxy: GeometryProxy
+    occupancy: OccupancyGrid
+
+
 @one_thread()
 def fuse_depth(
     proxy: GeometryProxy,
@@ -89,7 +104,8 @@ def fuse_depth(
     views: DepthViews,
     config: FusionConfig | None = None,
     hull_config: HullConfig | None = None,
-) -> GeometryProxy:
+    last: LastSurface | None = None,
+) -> FusedSurface:
     """The hull of these masks, tightened by depth views, within the box of its proxy.
 
     Args:
@@ -99,16 +115,23 @@ def fuse_depth(
         views: depth in real or virtual views.
         config: parameters of the fusion.
         hull_config: parameters of the hull, except its resolution, which is that of the fusion.
+        last: the last frame's surface; None without one.
 
     Raises:
         ValueError: there are masks of one camera only.
     """
     config = config or FusionConfig()
-    at_resolution = replace(hull_config or HullConfig(), resolution=config.resolution)
-    hull = visual_hull(mask, cameras, proxy.bounds, at_resolution)
-    fused = without_floating_parts(fuse_occupancy(hull, views, config), cameras)
+    box = proxy.bounds
+    resolution = config.resolution
+    if last is not None:
+        box, resolution = continued(box, resolution, last.occupancy)
+    hull = visual_hull(mask, cameras, box, replace(hull_config or HullConfig(), resolution=resolution))
+    fused = fuse_occupancy(hull, views, config)
+    if last is not None:
+        fused = steadied(fused, hull, last, config.last_share)
+    fused = without_floating_parts(fused, cameras)
     mesh = extract_surface(fused)
-    return GeometryProxy(mesh, vertex_normals(mesh), proxy.bounds)
+    return FusedSurface(GeometryProxy(mesh, vertex_normals(mesh), proxy.bounds), fused)
 
 
 def fuse_occupancy(hull: OccupancyGrid, views: DepthViews, config: FusionConfig) -> OccupancyGrid:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from viewmend.completed_cameras import complete_views, place_around, with_finer_images
 from viewmend.frame_cache import CachedFrame, all_masks, cache_frame
-from viewmend.fused_geometry import fuse_geometry
+from viewmend.fused_geometry import FusedFrame, fuse_geometry
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import GeometryProxy
@@ -144,6 +144,8 @@ class Renderer:
         """The cameras around the subject whose views are completed ahead; None if none are."""
         self._fused: tuple[tuple[int, tuple[str, ...]], Stream] | None = None
         """Frame and left-out cameras of the last fused mesh, and a stream that holds this frame alone."""
+        self._last_fused: FusedFrame | None = None
+        """The frame of the last fused mesh, whose surface the next frame's starts from."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
         self.assets_version: str | None = None
@@ -191,6 +193,7 @@ class Renderer:
         self.rig_json = rig_json(rig.name, cameras, bounds or proxy.bounds, home, fps, version)
         self._variants.clear()
         self._fused = None
+        self._last_fused = None
         if self._completed_cameras:
             around = place_around(cameras.to("cpu"), home.center, rig.up, self._completed_cameras)
             self.virtual_cameras = with_finer_images(around)
@@ -320,11 +323,15 @@ class Renderer:
         masks = all_masks(cached.frame)
         config = self._config
         render = config.render
-        proxy = fuse_geometry(cached, masks, self._depth_model, render, config.fusion, config.hull)
+        last = self._last_fused
+        made = fuse_geometry(cached, masks, self._depth_model, render, config.fusion, config.hull, last)
+        self._last_fused = made
         if self._depth_model is self._inpainter:
             fused = Stream(self._inpainter, self._config, stream.bounds, self._error_model)
-            fused.add_frame(cached.frame, geometry=proxy)
+            fused.adopt(made.cached)
             self._fused = ((index, left_out), fused)
+        proxy = made.cached.proxy
+        assert isinstance(proxy, GeometryProxy), "hulls are fused"
         return make_mesh(cached.frame.to("cpu"), proxy.to("cpu"), render)
 
     def complete_virtual_camera(self, index: int, without: tuple[str, ...], number: int) -> CompletedImage:
