@@ -544,7 +544,9 @@ def test_colours_are_not_blamed_where_only_a_cut_off_camera_sees_the_same_surfac
         assert [issue.odd_image for issue in issues] == [name]
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (412345.6, 4512345.6, 210.0)])
+@pytest.mark.parametrize(
+    "offset", [(0.0, 0.0, 0.0), (412345.6, 4512345.6, 210.0), (-412345.6, -4512345.6, -210.0)]
+)
 def test_a_capture_far_from_the_origin_is_computed_near_it(plain, offset):
     before = open_capture(plain.path)
     near = read_any_calibration(plain.path)

@@ -102,6 +102,11 @@ def test_the_shortest_film_ends_the_capture():
     assert clock.end == 20 and "the masks of camera 'b' end 0.13 s before the images'" in said(clock)[0]
 
 
+def test_a_camera_that_starts_late_is_said():
+    clock = match_tracks(tracks(a=range(24), b=range(24), c=range(12, 24)))
+    assert len(said(clock)) == 1 and "the images of camera 'c' start 0.40 s after" in said(clock)[0]
+
+
 def test_films_without_a_common_time_start_together_and_this_is_said():
     clock = match_tracks(tracks(a=range(9), b=range(9), c=range(9000, 9009)))
     assert clock.frames["c", "images"].tolist() == list(range(9))

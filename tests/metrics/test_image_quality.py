@@ -7,7 +7,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from viewmend.metrics.image_quality import MAX_PSNR_DB, mask_iou, psnr, ssim_map
+from viewmend.metrics.image_quality import MAX_PSNR_DB, change, mask_iou, psnr, ssim_map
 
 
 @pytest.fixture
@@ -83,6 +83,17 @@ def test_no_pixels_give_none(pair):
     assert psnr(*pair, none) is None
     assert ssim_map(pair[0][:, :10], pair[1][:, :10]) is None
     assert mask_iou(none, none) is None
+
+
+def test_changes_up_and_down_do_not_cancel():
+    previous = torch.full((3, 4, 4), 0.5)
+    image = previous.clone()
+    image[:, :2] += 0.1
+    image[:, 2:] -= 0.1
+    pixels = torch.zeros(4, 4, dtype=torch.bool)
+    pixels[1:3] = True
+    assert change(image, previous, pixels, min_px=8) == pytest.approx(0.1)
+    assert change(image, previous, pixels, min_px=9) is None
 
 
 def test_mask_iou_counts_pixels():
