@@ -1,5 +1,6 @@
 """Malformed messages, floods, slow clients and broken connections leave the server as it was."""
 
+import asyncio
 import contextlib
 import http.client
 import json
@@ -96,6 +97,28 @@ def test_a_fault_of_the_server_is_logged_and_ends_the_connection(ball, monkeypat
         close_code(unlucky)
     wait_until(lambda: type(error).__name__ in caplog.text)
     monkeypatch.undo()
+    assert ball.is_serving()
+
+
+def test_a_fault_in_the_first_messages_ends_both_tasks_of_the_connection(ball, monkeypatch):
+    faulty = []
+
+    def fail(self, _):
+        faulty.append((self, asyncio.get_running_loop()))
+        raise KeyError("a field")
+
+    monkeypatch.setattr(connection.ViewerConnection, "send_due", fail)
+    with open_websocket(ball) as unlucky:
+        say_hello(unlucky)
+        close_code(unlucky)
+    monkeypatch.undo()
+    ((_, loop),) = faulty  # the connection is kept, so that its tasks are not removed as garbage
+
+    def unfinished():
+        names = {task.get_coro().__qualname__ for task in asyncio.all_tasks(loop)}
+        return names & {"ViewerConnection._read", "ViewerConnection._write"}
+
+    wait_until(lambda: not unfinished(), seconds=20)
     assert ball.is_serving()
 
 

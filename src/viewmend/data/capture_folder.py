@@ -92,8 +92,8 @@ def origin_of(source: CaptureSource) -> Float64[np.ndarray, "3"]:
 class CaptureFolder:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
-    A camera whose image or mask is missing in a frame is absent from that frame (a gap). Videos are
-    matched by the times of their frames. Images and masks are undistorted to pinhole images with the
+    A camera that lacks one of its files in a frame (image, mask or depth) is absent from that frame (a gap).
+    Videos are matched by the times of their frames. Images and masks are undistorted to pinhole images with the
     same K, and padded at the right and bottom to the size of the largest image. The arguments are
     those of `open_capture`, which logs `issues`.
 
@@ -322,7 +322,8 @@ class CaptureFolder:
             got = "no camera that has all"
         _, where = readers[example][0].locate(example, time)
 
-        # A frame can be removed: from the list in `cameras.json`; in other formats, by removing its images
+        # The user can also remove the frame: from the list in `cameras.json`; in other formats, by removing its
+        # images. With a clock, the list only names the times, so a time cannot be removed there
         only_masks = absent == ["mask"]
         steps = ["add them, black ones if there is no subject"] if only_masks else ["add them"]
         if self._file.name == CALIBRATION and self.clock is None:

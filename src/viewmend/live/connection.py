@@ -190,8 +190,8 @@ class ViewerConnection:
 
     async def _serve(self) -> None:
         tasks = [asyncio.create_task(work()) for work in (self._read, self._write)]
-        self._registry.join(self)
         try:
+            self._registry.join(self)
             done, _ = await asyncio.wait([*tasks, self._failed], return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._registry.leave(self)
@@ -386,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # A message counts the frames of the second before it. If no frame was sent in the second before the last
-        # message, nor since, the last message said 0, and the next one would, too.
+        # The message reports frames per second: the number of frames sent in the second before it. If no frame was
+        # sent since one second before the last message, that message reported 0, and a new one would repeat it.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

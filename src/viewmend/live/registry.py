@@ -76,8 +76,8 @@ class SessionRegistry:
             self._sender = asyncio.create_task(self._send_to_all(shared))
 
     def leave(self, connection: Connection) -> None:
-        """Forget a connection that has ended."""
-        del self.connections[connection]
+        """Forget a connection that has ended. Its `join` may have failed."""
+        self.connections.pop(connection, None)
 
     async def _send_to_all(self, shared: SharedState) -> None:
         """Let all connections send what is due, while there are any; they already know the state `shared`."""

@@ -141,7 +141,8 @@ class Processes:
         else:
             gathered = [torch.empty_like(own) for _ in range(self.count)]
             torch.distributed.all_gather(gathered, own)
-        # Stacked, the axes are: stream of its process, process, field. So flattening orders streams by number
+        # Axes after stacking: index i of a stream within its process, process, field. Stream i of process p has
+        # the number i * count + p, so flattening the first two axes orders streams by number
         by_number = torch.stack(gathered, 1).flatten(0, 1)
         return tuple(ReplayPosition(*position) for position in by_number.tolist())
 

@@ -24,8 +24,8 @@ of the group's images from their tick, times this factor."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
 MAX_COMPLETE = 4
-"""This many groups are kept until they are taken, besides those that may still wait for images: one for each tick
-of the waiting time. If there are more, the oldest are dropped."""
+"""An `Aligner` keeps at most this many groups, plus one for each tick within the time that a group may wait for
+images. If there are more, the oldest are dropped."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,8 @@ class DecodedImage:
     taken_s: float
     """When it was taken, on this machine's monotonic clock."""
     first_field: str = "auto"
-    """Which field is shown first if the frame is interlaced; see `VideoProperties.first_field`."""
+    """Which field is shown first if the frame is interlaced; see `VideoProperties.first_field`. It stays
+    "auto" for recordings, because `decode` de-interlaces interlaced videos."""
 
     def to_rgb(self, size_px: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
         """The image, or its first field if it is interlaced, as upright sRGB at its own or another size."""
@@ -105,7 +106,8 @@ class Playback:
             shift_s = float(shifted.times_s[0] - original.times_s[0])
             shifts_s[original.camera] = shift_s - first_s
 
-        # Readers on other threads compare both before each image, and join the others again if one has changed
+        # Before each image, a reader (on another thread) compares the length and its shift with those that it began
+        # with. If either differs, it begins again with the new values, in the lap that all recordings are in
         self.length_s = min(ends_s) - first_s
         self.shifts_s = shifts_s
         return clock.timecode_note

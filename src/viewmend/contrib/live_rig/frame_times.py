@@ -58,9 +58,9 @@ class SenderTimes(ImageTimes):
         self._clock = SenderClock()
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
-        """When the reader received the last `lag_packets + 1` packets, the oldest first; None for those it did not
-        wait for. FFmpeg returned the oldest of these packets when the data of the newest arrived. So the
-        first of these times is when the newest packet's data arrived."""
+        """When FFmpeg returned the last `lag_packets + 1` packets, the oldest first; None for those that the reader
+        did not wait for. FFmpeg returns packet n when it receives the data of packet n + `lag_packets`. So the
+        first of these times is when the data of the last of these packets arrived."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

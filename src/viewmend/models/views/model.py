@@ -331,8 +331,8 @@ class ViewSynthNet(Network):
         where = view.refine_mask & (view.depth_with_rim > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # At the lowest quality, background is attenuated, and holes are filled from the pixels around them. A view
-        # with neither is returned unchanged below
+        # At the lowest quality, `where` contains only holes, which are filled from the pixels around them. Pixels in
+        # `faded` are attenuated. A view without holes and without faded pixels is returned unchanged below
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
