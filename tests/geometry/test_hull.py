@@ -136,7 +136,7 @@ def test_bounds_from_masks_hold_the_subject(scale):
     bounds = bounds_from_masks(masks, replace(cameras, camera_from_world=pose))
     center = torch.tensor([0.2, 0.1, 0.3]) * scale
     assert (bounds.low <= center - 0.4 * scale).all() and (bounds.high >= center + 0.4 * scale).all()
-    assert float(bounds.size_m.max()) < 3 * scale
+    assert float(bounds.size_m.max()) < 1.5 * scale, "as by the masks, not by all that the cameras see"
 
 
 def test_bounds_hold_what_cameras_look_at_and_cameras_that_look_apart_have_none():
