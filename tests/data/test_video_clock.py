@@ -205,6 +205,9 @@ def test_an_offset_is_subtracted_from_the_times_of_a_camera(ball):
     write_capture(BallCapture(ring(4), 8), images, images="png")
     edit(images, lambda content: content["cameras"][0].update(offset_ms=-100))
     assert [seen.get("c0") for seen in shown(open_capture(images))] == [None, 0, 1, 2, 3, 4, 5, 6]
+    edit(images, lambda content: content["cameras"][0].update(offset_ms=200))
+    pair = shown(open_capture(images, ["c0", "c1"]))
+    assert pair == [{"c0": time + 2, "c1": time} for time in range(6)]
 
 
 def test_masks_may_be_films_of_another_rate(ball):

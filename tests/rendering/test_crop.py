@@ -61,7 +61,9 @@ def test_crops_lie_within_the_view(scene):
     found = mesh_crop(proxy.mesh.vertices, away)
     assert found.left < found.right <= 64 and found.top < found.bottom <= 48
     beside = view_camera(Camera(azimuth=0.0, target=(-5.0, 0.0, 0.0)), frame, (64, 48))
-    assert min(found.right - found.left, mesh_crop(proxy.mesh.vertices, beside).right) == 1, "at least one pixel"
+    assert min(found.right - found.left, mesh_crop(proxy.mesh.vertices, beside).right) == 1, (
+        "at least one pixel"
+    )
     near = view_camera(Camera(distance=0.05), frame, (64, 48))
     assert mesh_crop(proxy.mesh.vertices, near) == Crop.all_of(near), (
         "a part of the subject is behind the camera"

@@ -44,6 +44,8 @@ class CameraReader:
         """Whether the user was warned of the rotation."""
         self._folder = folder
         self._frames = frames
+        """All frame ids that are listed; with a clock, the capture may have fewer frames."""
+        self._num_frames = len(frames) if clock is None else len(clock.times_s)
         self._undistortion = Undistortion(camera)
         self._video = VideoFile(folder / camera.video) if camera.video else None
         has_mask_video = camera.mask is not None and is_video(camera.mask)
@@ -51,7 +53,7 @@ class CameraReader:
         self._curves = None if camera.colour is None else colour_curves(camera.colour)
 
         # Which image or mask belongs to each frame of the capture
-        in_order = np.arange(len(frames))
+        in_order = np.arange(self._num_frames)
         by_clock = {} if clock is None else clock.frames
         images = by_clock.get((camera.name, "images"), in_order)
         masks = images if camera.video is None or self._has_mask_per_image() else in_order
@@ -67,8 +69,9 @@ class CameraReader:
         """
         if self._video is None or self.camera.mask is None or self._mask_video is not None:
             return False
-        count = sum((self._folder / self.camera.file("mask", frame)).is_file() for frame in self._frames)
-        return count < len(self._frames) and count == video_properties(self._video.path).frames
+        frames = self._frames[: self._num_frames]
+        count = sum((self._folder / self.camera.file("mask", frame)).is_file() for frame in frames)
+        return count < self._num_frames and count == video_properties(self._video.path).frames
 
     def has(self, time: int, exists: Callable[[str], bool]) -> bool:
         """Whether the camera has all of its files in the frame at index `time`; `exists` looks a path up."""

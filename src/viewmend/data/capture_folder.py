@@ -125,10 +125,10 @@ class CaptureFolder:
         self.cameras = pinhole_cameras(self._native_cameras)
         self.clock = read_clock(replace(calibration, cameras=self._native_cameras))
         """When the frames were taken; None for a capture of images without offsets (see `read_clock`)."""
-        self._num_listed = len(calibration.frames)
+        self._listed = calibration.frames
 
         # The frame ids name the times of the clock in order; ids beyond its last time are not used
-        num_frames = self._num_listed if self.clock is None else len(self.clock.times_s)
+        num_frames = len(self._listed) if self.clock is None else len(self.clock.times_s)
         self.frame_ids = calibration.frames[:num_frames]
         self.fps = calibration.fps
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
@@ -144,7 +144,7 @@ class CaptureFolder:
         self.has_masks = self._cameras_have("mask")
         self.has_depth = self._cameras_have("depth")
         self._readers = tuple(
-            CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._native_cameras
+            CameraReader(folder, camera, calibration.frames, self.clock) for camera in self._native_cameras
         )
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
@@ -169,8 +169,8 @@ class CaptureFolder:
             )
         if self.clock is not None:
             found = len(self.frame_ids)
-            if found < self._num_listed:
-                expected = f"{self._num_listed} frames as listed"
+            if found < len(self._listed):
+                expected = f"{len(self._listed)} frames as listed"
                 got = f"videos with {found} common times"
                 issues.append(Issue(f"expected {expected}, got {got}; the other frames are left out"))
             issues.extend(self.clock.issues(self.cameras.names))
@@ -285,7 +285,7 @@ class CaptureFolder:
         """The error message for a camera that lacks a file in every frame."""
         kinds = camera.file_kinds
         absent: list[FileKind] = [
-            kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self.frame_ids)
+            kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in self._listed)
         ]
 
         # The message names a file of the first frame as an example: one of an absent kind, if there is any
@@ -322,13 +322,15 @@ class CaptureFolder:
             got = "no camera that has all"
         _, where = readers[example][0].locate(example, time)
 
-        # The user can also remove the frame: from the list in `cameras.json`; in other formats, by removing its
-        # images. With a clock, the list only names the times, so a time cannot be removed there
         only_masks = absent == ["mask"]
         steps = ["add them, black ones if there is no subject"] if only_masks else ["add them"]
-        if self._file.name == CALIBRATION and self.clock is None:
-            steps.append(f"remove the frame from {self._file}")
-        elif self._file.name != CALIBRATION and "image" in kinds and "image" not in absent:
+        has_images = "image" in kinds and "image" not in absent
+        if self._file.name == CALIBRATION:
+            # The frame can be removed from the list, unless the list only names the times of a clock
+            if self.clock is None:
+                steps.append(f"remove the frame from {self._file}")
+        elif has_images:
+            # In other formats, the images that are there are the list of frames
             steps.append("remove the frame's images")
         return f"{where}: expected {wanted}, got {got}; {', or '.join(steps)}"
 
