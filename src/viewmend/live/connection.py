@@ -386,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # The message reports frames per second: the number of frames sent in the second before it. If no frame was
-        # sent since one second before the last message, that message reported 0, and a new one would repeat it.
+        # The message reports the number of frames sent in the second before it. If none was sent in the second
+        # before the last message, nor after it, the last message reported 0, and a new one would report 0 again.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

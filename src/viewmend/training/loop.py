@@ -60,8 +60,8 @@ def train(
     """Train, or resume the run in `out`; under torchrun, with all of its processes.
 
     `out` gets the averaged weights (model.safetensors, config.json, README.md), run.safetensors to
-    resume from, log.jsonl, and images of the validation. A resumed run makes exactly the steps it
-    would have made uninterrupted.
+    resume from, log.jsonl, and images of the validation. Without a time limit, a resumed run makes
+    exactly the steps it would have made uninterrupted.
 
     Args:
         config: what to train, and how; its objective may come from outside of the package.

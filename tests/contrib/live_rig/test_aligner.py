@@ -100,6 +100,14 @@ def test_a_fast_camera_with_a_wrong_clock_does_not_set_the_first_tick():
     assert times(group) == {"a": 1.0, "b": 1.0} and rig.counts["c"]["misaligned"] == 1
 
 
+def test_a_camera_whose_clock_is_in_the_future_is_not_waited_for():
+    rig = aligner()
+    put(rig, "ab", 1.0)
+    rig.put("c", TimedImages(9.0, IMAGES), 1.0)
+    [group] = rig.take(1.0)
+    assert times(group) == {"a": 1.0, "b": 1.0} and rig.counts["c"] == {"misaligned": 1}
+
+
 def test_pictures_far_from_their_time_are_left_out():
     rig = aligner("ab", tolerance_s=0.01)
     put(rig, "a", 1.0)

@@ -98,7 +98,7 @@ class Aligner:
         `period_s` is the time between two images of the camera; 0 if it is unknown. Before `put` has set
         tick 0, all images are wanted.
         """
-        is_fast = self._interval_s >= FAST_RATIO * period_s > 0
+        is_fast = period_s > 0 and self._interval_s >= FAST_RATIO * period_s
         if not is_fast or self._origin_s is None:
             return True
         return abs(self._nearest(taken_s).offset_s) <= period_s / 2
@@ -113,11 +113,12 @@ class Aligner:
     def put(self, name: str, timed: TimedImages, now_s: float) -> None:
         """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
         counts = self.counts[name]
-        self._heard_s[name] = now_s
-        # An image from the future is dropped before it can affect ticks: the camera's clock is wrong.
+        # An image from the future is dropped before it can affect ticks, and its camera, whose clock is wrong, is
+        # not waited for.
         if timed.taken_s > now_s + self._interval_s / 2:
             counts["misaligned"] += 1
             return
+        self._heard_s[name] = now_s
         tick = self._nearest(timed.taken_s)
         self._last_tick[name] = max(self._last_tick[name], tick.number)
         if tick.number <= self._last_finished:

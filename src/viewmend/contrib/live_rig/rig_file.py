@@ -184,8 +184,9 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file() or is_capture_file(path, format):
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # A calibration may consist of several files, of which the rig may name any. But a file with the suffix of
-    # the one that was read may be a different calibration, so it is refused unless the format is given.
+    # In the folder, the calibration that comes first in the order of formats was read. If the rig names another
+    # file of the same type, such as another JSON file, it may mean another calibration; the format then decides.
+    # A file of another type, such as `images.bin` of COLMAP, belongs to the calibration that was read.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

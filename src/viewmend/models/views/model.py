@@ -499,6 +499,7 @@ def depth_of_cells(view: IncompleteView, predicted: Mask) -> CellDepth:
 
 def halve(inputs: CellInputs) -> CellInputs:
     """The inputs at half the resolution. One of their cells covers 4 x 4 pixels of the full resolution."""
+    # A pixel of half the resolution is predicted if any of its four is: without one, the nearest depth is 0
     predicted = nearest_depth(inputs.view.depth * inputs.predicted) > 0
     filled = downsample2x(replace(inputs.view, rgb=inputs.image.filled)).rgb
     view = downsample2x(inputs.view)
@@ -552,7 +553,7 @@ def amplify_detail(
     Args:
         colours: the colour of each pixel in each image.
         mask: the cameras' mean mask at each pixel.
-        gains: the gain of each band of each image, bands first, as `NUM_GAINS`.
+        gains: the gains of each pixel: those of all images for the first band, then for the second.
         pixels: row and column of each pixel.
         shape: height and width of the images.
         magnification: that of the images (`SourceCameras.magnification`).
