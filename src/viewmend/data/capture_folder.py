@@ -127,7 +127,7 @@ class CaptureFolder:
         """When the frames were taken; None for a capture of images without offsets (see `read_clock`)."""
         self._listed = calibration.frames
 
-        # The frame ids name the times of the clock in order; ids beyond its last time are not used
+        # With a clock, the frame id at index i stands for the clock's time i; surplus ids are not used
         num_frames = len(self._listed) if self.clock is None else len(self.clock.times_s)
         self.frame_ids = calibration.frames[:num_frames]
         self.fps = calibration.fps
@@ -326,7 +326,7 @@ class CaptureFolder:
         steps = ["add them, black ones if there is no subject"] if only_masks else ["add them"]
         has_images = "image" in kinds and "image" not in absent
         if self._file.name == CALIBRATION:
-            # The frame can be removed from the list, unless the list only names the times of a clock
+            # Without a clock, a frame can be removed from the list. With one, its ids stand for the clock's times
             if self.clock is None:
                 steps.append(f"remove the frame from {self._file}")
         elif has_images:
@@ -374,7 +374,7 @@ def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> Na
     paths = [camera.file("image", frame) for frame in frames]
     existing = [folder / path for path in paths if stays_inside(path) and (folder / path).is_file()]
     if existing and not any(uses_alpha(file) for file in existing):
-        # This raises the error for the first image, which has no alpha or cannot be read
+        # No image has alpha that cuts something out. For the first one, this raises an error that says why
         read_alpha(existing[0], f"{existing[0]}: camera '{camera.name}'")
     return replace(camera, mask=camera.image, mask_labels=False)
 

@@ -141,8 +141,8 @@ class Processes:
         else:
             gathered = [torch.empty_like(own) for _ in range(self.count)]
             torch.distributed.all_gather(gathered, own)
-        # Axes after stacking: index i of a stream within its process, process, field. Stream i of process p has
-        # the number i * count + p, so flattening the first two axes orders streams by number
+        # After stacking, the axes are (i, process, field), where i counts the streams of a process. Stream i of
+        # process p has the number i * count + p, so flattening the first two axes orders streams by number
         by_number = torch.stack(gathered, 1).flatten(0, 1)
         return tuple(ReplayPosition(*position) for position in by_number.tolist())
 
@@ -470,9 +470,8 @@ class Run:
         folder.mkdir(exist_ok=True)
         for number, sample in enumerate(batch):
             data = sample_to_bytes(sample)
-            write_atomically(
-                folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data)
-            )
+            file = folder / f"{self.processes.rank}-{number:02d}.safetensors"
+            write_atomically(file, lambda path, data=data: path.write_bytes(data))
         raise FloatingPointError(
             f"expected a finite loss, got {float(total)} at step {step}; inspect its samples in {folder}, or lower "
             "the learning rate and resume from the last checkpoint"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from viewmend.contrib.live_rig.aligner import MAX_COMPLETE, Aligner, TimedImages
+from viewmend.contrib.live_rig.aligner import EXTRA_GROUPS, Aligner, TimedImages
 from viewmend.data.camera_images import CameraImages
 
 IMAGES = CameraImages(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.uint8), None)
@@ -131,9 +131,9 @@ def test_what_nobody_takes_is_bounded_and_the_newest_wins():
         put(rig, "ab", n * FRAME_S)
     out = rig.take(99 * FRAME_S)
     assert [round(group.by_camera["a"].taken_s / FRAME_S) for group in out] == list(
-        range(100 - MAX_COMPLETE - 3, 100)
+        range(100 - EXTRA_GROUPS - 3, 100)
     )
-    assert rig.counts["a"] == {"used": MAX_COMPLETE + 3, "replaced": 100 - MAX_COMPLETE - 3}
+    assert rig.counts["a"] == {"used": EXTRA_GROUPS + 3, "replaced": 100 - EXTRA_GROUPS - 3}
 
 
 def test_the_line_follows_cameras_of_another_rate():

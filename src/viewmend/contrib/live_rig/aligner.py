@@ -23,9 +23,9 @@ PHASE_GAIN = 0.05
 of the group's images from their tick, times this factor."""
 FAST_RATIO = 1.5
 """A camera that takes at least this many images per tick is fast: only those nearest to a tick are used."""
-MAX_COMPLETE = 4
-"""An `Aligner` keeps at most this many groups, plus one for each tick within the time that a group may wait for
-images. If there are more, the oldest are dropped."""
+EXTRA_GROUPS = 4
+"""An `Aligner` keeps as many groups as there are ticks in the time that a group may wait for images, and this
+many more. If there are more than that, the oldest are dropped."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Aligner:
         self._absent_s = max(ABSENT_S, ABSENT_TICKS * interval_s)
         self._origin_s: float | None = None
         """Time of tick 0; None before the first image."""
-        self._max_groups = MAX_COMPLETE + math.ceil(wait_s / interval_s)
+        self._max_groups = EXTRA_GROUPS + math.ceil(wait_s / interval_s)
         self._groups: dict[int, ImageGroup] = {}
         self._last_finished = -math.inf
         """The last tick that was taken or dropped."""

@@ -59,8 +59,8 @@ class SenderTimes(ImageTimes):
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
         """When FFmpeg returned the last `lag_packets + 1` packets, the oldest first; None for those that the reader
-        did not wait for. With a lag of 1, FFmpeg returns packet 6 when the data of packet 7 arrives; so when 7 has
-        been returned, too, the oldest time, that of 6, is when the data of the newest packet, 7, arrived."""
+        did not wait for. With a lag of 1, the data of packet 7 make FFmpeg return packet 6. So the data of the
+        newest packet here arrived at the oldest of these times."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

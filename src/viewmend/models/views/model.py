@@ -331,13 +331,12 @@ class ViewSynthNet(Network):
         where = view.refine_mask & (view.depth_with_rim > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # At the lowest quality, `where` contains only holes, which are filled from the pixels around them. Pixels in
-        # `faded` are attenuated. A view without holes and without faded pixels is returned unchanged below
+        # At the lowest quality, holes (all that `where` then contains) are filled from the pixels around them, and
+        # faded pixels are attenuated
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
-        # Without a pixel to predict, or without a camera, nothing is predicted. Background that `view.fade`
-        # marks is still attenuated
+        # Without a pixel to predict, or without a camera, faded pixels are attenuated, and all others stay
         sources = None
         scale, count = SceneScale.with_count(view, where)
         if count:
@@ -499,7 +498,8 @@ def depth_of_cells(view: IncompleteView, predicted: Mask) -> CellDepth:
 
 def halve(inputs: CellInputs) -> CellInputs:
     """The inputs at half the resolution. One of their cells covers 4 x 4 pixels of the full resolution."""
-    # A pixel of half the resolution is predicted if any of its four is: without one, the nearest depth is 0
+    # Depths of pixels that are not predicted become 0, and `nearest_depth` ignores zeros. So the nearest depth of
+    # four pixels is above 0 if any of them is predicted
     predicted = nearest_depth(inputs.view.depth * inputs.predicted) > 0
     filled = downsample2x(replace(inputs.view, rgb=inputs.image.filled)).rgb
     view = downsample2x(inputs.view)
