@@ -330,7 +330,7 @@ class CaptureFolder:
             if self.clock is None:
                 steps.append(f"remove the frame from {self._file}")
         elif has_images:
-            # In other formats, the images that are there are the list of frames
+            # Other formats have no list of frames: a frame exists if it has images
             steps.append("remove the frame's images")
         return f"{where}: expected {wanted}, got {got}; {', or '.join(steps)}"
 

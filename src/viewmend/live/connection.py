@@ -302,8 +302,8 @@ class ViewerConnection:
     def send_due(self, shared: SharedState) -> float:
         """Send the messages that are due, and end the connection if a frame was not acknowledged in time.
 
-        The result is a time on the service's clock. Until then, the registry need not call this again unless
-        `shared` changes or the viewer sends a message. It is the present time if no call may be left out.
+        The result is the time of the next call that is needed, on the service's clock. The present time means: at
+        the next check. The registry calls earlier if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
@@ -386,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # The message reports the number of frames sent in the second before it. So it can only differ from the last
-        # message if a frame was sent later than one second before that message.
+        # The message reports the number of frames sent in the second before it. If no frame was sent in the last
+        # message's second or since then, both messages report 0.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

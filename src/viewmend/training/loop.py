@@ -69,7 +69,7 @@ def train(
         start: the model to start from, instead of the one that `config.start` names.
         report: called after each step in the first process.
         stopped: called before each step and after the last, in every process; once any returns True,
-            the run ends with a checkpoint.
+            the run ends, with a checkpoint of the steps that it has made.
 
     Returns:
         `out`.
@@ -270,7 +270,7 @@ class Run:
         self.adversary = self.objective.adversary
         self.state = RunState(step=0, elapsed_s=0.0, positions=())
         self.last_scores: dict[str, float | None] = {}
-        """Scores of the latest validation; {} before the first."""
+        """Scores of the latest validation of this process; {} before its first."""
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
         if self.adversary is not None:
@@ -347,8 +347,8 @@ class Run:
     def _make_validation(self) -> Validation | None:
         """The function that scores the model; None in processes that do not validate.
 
-        A run that keeps the best weights is scored on views that its captures hold back, all others as their
-        objective says.
+        A run that keeps the best weights is scored on views that its captures hold back. Other runs are scored
+        by their objective's own validation.
         """
         if not self.config.validate_every or not self.processes.is_first:
             return None

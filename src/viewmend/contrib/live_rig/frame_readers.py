@@ -133,7 +133,7 @@ def read_images(
         wait: waits for some seconds before a recording's next image; returns True to end the recording.
 
     Raises:
-        OSError: the camera cannot be opened, its stream ends, or it is silent.
+        OSError: the camera cannot be opened; or it is a stream that ends or is silent.
     """
     return _play_recording(camera, playback, wait) if camera.is_file else _receive_stream(camera, counts)
 

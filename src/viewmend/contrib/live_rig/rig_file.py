@@ -184,9 +184,9 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file() or is_capture_file(path, format):
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # In the folder, the calibration that comes first in the order of formats was read. If the rig names another
-    # file of the same type, such as another JSON file, it may mean another calibration, so it must name the format.
-    # A file of another type, such as `images.bin` of COLMAP, belongs to the calibration that was read.
+    # One calibration of the folder was read. If the rig names another file with the same suffix, that file may be a
+    # different calibration: unless the rig names a format, this is an error. A file with another suffix is
+    # taken to belong to the calibration that was read.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(

@@ -331,8 +331,8 @@ class ViewSynthNet(Network):
         where = view.refine_mask & (view.depth_with_rim > 0)
         faded = torch.zeros_like(where) if view.fade is None else view.fade > 0
 
-        # At the lowest quality, holes (all that `where` then contains) are filled from the pixels around them, and
-        # faded pixels are attenuated
+        # At the lowest quality, `where` contains only holes. They are filled from the pixels around them, and faded
+        # pixels are attenuated
         if fraction == 0 and bool((where | faded).any()):
             return fallback_view(view, faded, self.fill_holes(view, None, quick=True)), state
 
