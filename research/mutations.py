@@ -35,7 +35,7 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 """The repository has this path."""
 PARTS = {
-    "geometry": ("tests/geometry", "tests/laws"),
+    "geometry": ("tests/geometry", "tests/laws", "tests/test_publishing.py"),
     "rendering": ("tests/rendering", "tests/models/test_error_predictor.py", "tests/test_stream.py"),
     "models": ("tests/models", "tests/laws"),
     "data": ("tests/data",),
