@@ -302,8 +302,8 @@ class ViewerConnection:
     def send_due(self, shared: SharedState) -> float:
         """Send the messages that are due, and end the connection if a frame was not acknowledged in time.
 
-        The result is the time of the next call that is needed, on the service's clock. The present time means: at
-        the next check. The registry calls earlier if `shared` changes or the viewer sends a message.
+        Returns when this has to be called next, on the service's clock; for a viewer that is not idle, that is at
+        once. The registry calls earlier if `shared` changes or the viewer sends a message.
         """
         session = self._session
         now = self._now()
@@ -386,8 +386,8 @@ class ViewerConnection:
     def _send_statistics(self, viewers: int) -> None:
         """Send statistics if they or the number of viewers have changed, at most once a second."""
         now = self._now()
-        # The message reports the number of frames sent in the second before it. If no frame was sent in the last
-        # message's second or since then, both messages report 0.
+        # Statistics count the frames sent in the second before them. If none was sent since one second before the
+        # previous statistics, these said 0, and new ones would say 0 again.
         has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
         if has_news and now - self._sent.stats_s >= 1:
             self._sent.stats_s = now

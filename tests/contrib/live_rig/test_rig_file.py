@@ -87,6 +87,15 @@ def test_the_calibration_may_be_named_by_its_file(folder):
     assert len(rig.cameras) == 2
 
 
+def test_another_file_than_the_calibration_is_refused_or_reported(folder, caplog):
+    (folder / "take" / "other.json").write_text("{}")
+    with pytest.raises(CaptureError, match=r"which is cameras\.json; name the format"):
+        read(folder, rig_text(NAMES, calibration='"take/other.json"'))
+    rig = read(folder, rig_text(NAMES, calibration='"take/other.json"', format='"plain"'))
+    assert [camera.name for camera in rig.cameras] == list(NAMES)
+    assert "the calibration is read from cameras.json, as of format 'plain'" in caplog.text
+
+
 def test_the_calibration_may_be_a_file_that_stands_for_a_capture(folder):
     """RIFTCast's meta file may lie outside of the data set's folder."""
     cameras = named(random_rig(3, 2, 0), "{}")

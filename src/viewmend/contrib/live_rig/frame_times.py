@@ -59,9 +59,8 @@ class SenderTimes(ImageTimes):
         self._lag_packets = lag_packets
         self._arrivals_s: deque[float | None] = deque(maxlen=lag_packets + 1)
         """When FFmpeg returned the last `lag_packets + 1` packets, the oldest first; None for those that the reader
-        did not wait for. With a lag of 1, FFmpeg returns packet 5 when the data of packet 6 arrive, and packet 6
-        when those of packet 7 arrive. So packet 6's own data arrived when packet 5 was returned: at the oldest of
-        these times."""
+        did not wait for. FFmpeg returns packet n when the data of packet n + `lag_packets` arrive. So the data of the
+        packet that was returned last arrived when the first of these packets was returned."""
 
     def add_packet(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         """See `ImageTimes.add_packet`."""

@@ -1,5 +1,6 @@
 """A live rig's `rig.toml`: its calibration, the address of each camera, and how masks are made."""
 
+import logging
 import re
 import tomllib
 from dataclasses import dataclass, replace
@@ -14,6 +15,8 @@ from viewmend.data.errors import CaptureError
 from viewmend.data.formats import is_capture_file, read_any_calibration
 from viewmend.data.native_format import NativeCalibration, NativeCamera
 from viewmend.utils.untrusted_input import bounded_bytes, one_of, typed
+
+log = logging.getLogger("viewmend.live")
 
 MAX_BYTES = 1_000_000
 """A rig's file has at most this many bytes."""
@@ -184,13 +187,17 @@ def _calibration(path: Path, format: str | None) -> NativeCalibration:
     if not path.is_file() or is_capture_file(path, format):
         return read_any_calibration(path, format)
     calibration = read_any_calibration(path.parent, format)
-    # One calibration of the folder was read. If the rig names another file with the same suffix, that file may be a
-    # different calibration: unless the rig names a format, this is an error. A file with another suffix is
-    # taken to belong to the calibration that was read.
+    # The reader has chosen a file of this folder. A named file with another suffix is taken to belong to it. One with
+    # the same suffix is probably another calibration, and is refused. If the rig names the format, it may still be
+    # a part of the calibration, as the two files of EasyMocap are; so there is only a warning.
     is_other = calibration.file.resolve() != path.resolve() and calibration.file.suffix == path.suffix
     if is_other and format is None:
         raise CaptureError(
             f"{path}: expected the folder's calibration, which is {calibration.file.name}; name the format"
+        )
+    if is_other:
+        log.warning(
+            "%s: the calibration is read from %s, as of format '%s'", path, calibration.file.name, format
         )
     return calibration
 
