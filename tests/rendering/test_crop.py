@@ -60,8 +60,8 @@ def test_crops_lie_within_the_view(scene):
     away = view_camera(Camera(azimuth=0.0, target=(5.0, 0.0, 0.0)), frame, (64, 48))
     found = mesh_crop(proxy.mesh.vertices, away)
     assert found.left < found.right <= 64 and found.top < found.bottom <= 48
-    beside = view_camera(Camera(azimuth=0.0, target=(-5.0, 0.0, 0.0)), frame, (64, 48))
-    assert min(found.right - found.left, mesh_crop(proxy.mesh.vertices, beside).right) == 1, (
+    to_the_left = view_camera(Camera(azimuth=0.0, target=(-5.0, 0.0, 0.0)), frame, (64, 48))
+    assert min(found.right - found.left, mesh_crop(proxy.mesh.vertices, to_the_left).right) == 1, (
         "at least one pixel"
     )
     near = view_camera(Camera(distance=0.05), frame, (64, 48))

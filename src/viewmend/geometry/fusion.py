@@ -22,7 +22,7 @@ from viewmend.geometry.hull_parts import without_floating_parts
 from viewmend.geometry.last_surface import LastSurface, continued, steadied
 from viewmend.geometry.mesh import vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.geometry.sampling import in_view
+from viewmend.geometry.sampling import in_view, nearest_pixels
 from viewmend.geometry.surface import extract_surface
 from viewmend.geometry.threads import one_thread, parallel_for
 from viewmend.utils.tensors import OnDevice
@@ -230,11 +230,9 @@ def _sums_at(
     sees = in_view(uv, z, cameras)
 
     # The depth and the confidence of the pixel that shows each point
-    last = (cameras.size_px - 1)[:, None]
-    pixel = torch.minimum(uv.nan_to_num(0.0).clamp_min(0).long(), last)
-    view = torch.arange(len(cameras), device=points.device)[:, None]
-    depth = views.depth[view, pixel[..., 1], pixel[..., 0]]
-    confidence = views.confidence[view, pixel[..., 1], pixel[..., 0]]
+    pixels = nearest_pixels(uv, cameras)
+    depth = views.depth[pixels]
+    confidence = views.confidence[pixels]
 
     # The signed distances to the surfaces, in voxels
     distance = (depth - z) / voxel_m

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.hull import OccupancyGrid
-from viewmend.geometry.sampling import in_view
+from viewmend.geometry.sampling import in_view, nearest_pixels
 
 SIMILAR = 6.0
 """The stillness of a pixel falls to 1/e at this change, in 255ths."""
@@ -127,10 +127,8 @@ def _stillness_at(
     cameras = last.cameras
     uv, z = project(points, cameras)
     inside = in_view(uv, z, cameras)
-    corner = (cameras.size_px - 1)[:, None]
-    pixel = torch.minimum(uv.nan_to_num(0.0).clamp_min(0).long(), corner)
-    view = torch.arange(len(cameras), device=points.device)[:, None]
-    surface = last.depth[view, pixel[..., 1], pixel[..., 0]]
-    still = torch.where(inside, last.stillness[view, pixel[..., 1], pixel[..., 0]], 1.0)
+    pixels = nearest_pixels(uv, cameras)
+    surface = last.depth[pixels]
+    still = torch.where(inside, last.stillness[pixels], 1.0)
     sees = inside & ((surface == 0) | (z < surface + BEHIND_VOXELS * voxel_m))
     return torch.where(sees.any(0), torch.where(sees, still, 1.0).amin(0), still.amin(0))

@@ -28,6 +28,16 @@ def in_view(
     return (z_m > 0) & ((uv_px >= 0) & (uv_px < cameras.size_px[:, None])).all(-1)
 
 
+def nearest_pixels(
+    uv_px: Float[Tensor, "view point 2"], cameras: Cameras
+) -> tuple[Int[Tensor, "view 1"], Int[Tensor, "view point"], Int[Tensor, "view point"]]:
+    """View, row and column of the pixel at each position, to index images with; at the border if there is none."""
+    last = (cameras.size_px - 1)[:, None]
+    column, row = torch.minimum(uv_px.nan_to_num(0.0).clamp_min(0).long(), last).unbind(-1)
+    view = torch.arange(len(cameras), device=uv_px.device)[:, None]
+    return view, row, column
+
+
 def bilinear_taps(uv_px: Float[Tensor, "view point 2"], cameras: Cameras) -> BilinearTaps:
     """The four pixels around each position in its camera's image, stacked in front, row by row.
 
