@@ -30,6 +30,12 @@ LOSE_GPU = (
     " await new Promise(r => setTimeout(r, 200)); e.restoreContext(); })()"
 )
 
+# A reload may take milliseconds and no request: the browser has the image already.
+COUNT_ORIGINALS = (
+    "window.originals = 0;"
+    " document.querySelector('#original-image').addEventListener('load', () => window.originals++)"
+)
+
 
 def cover(view) -> str:
     return view.page.locator("#cover").inner_text() if view.page.locator("#cover").is_visible() else ""
@@ -186,9 +192,13 @@ def test_a_lost_gpu_comes_back_with_the_original(browser, server):
         name = view.page.locator("#right-name")
         view.until(lambda: name.inner_text() == "Original", 60)
         view.settle()
+        before = view.picture()
+        view.page.evaluate(COUNT_ORIGINALS)
         view.page.evaluate(LOSE_GPU)
-        view.until(lambda: name.inner_text() != "Original", 20)
+        view.until("window.originals > 0", 20)
+        view.settle()
         view.until(lambda: name.inner_text() == "Original", 20)
+        assert np.abs(view.picture() - before).mean() < 2
         view.errors.clear()
 
 
