@@ -293,8 +293,7 @@ def other_geometry(
         return GeometryProxy(mesh, vertex_normals(mesh), studio.bounds)
     exact = [*rasterize(mesh, inputs.cameras).depth, rasterize(mesh, target).depth[0]]
     if kind == "depth":
-        torch.manual_seed(number)
-        maps = [NOISY.apply(own) for own in exact]
+        maps = [NOISY.apply(own, rng) for own in exact]
     else:
         corners = mesh.vertices[mesh.faces.long()]
         area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)

@@ -17,7 +17,7 @@ from viewmend.models.views.ray_fill import RayFill
 from viewmend.training.adversarial import GAN
 from viewmend.training.config import ObjectiveConfig, SamplingConfig, TrainConfig
 from viewmend.training.loop import train
-from viewmend.training.objective import ImageLoss, Objective, StepOutput, image_loss
+from viewmend.training.objective import HoleValidation, ImageLoss, Objective, StepOutput, image_loss
 from viewmend.training.paper import PaperObjectiveConfig, paper_image_loss
 from viewmend.training.rays import RayBatch, RayBatchScenes, RaysObjectiveConfig
 from viewmend.training.recipes import RECIPES, make_recipe
@@ -26,6 +26,16 @@ from viewmend.training.shards import ShardError, ShardScenes, sample_to_bytes, w
 from viewmend.training.views import ViewsObjectiveConfig
 
 EVERY_PIXEL = 10**6
+
+
+def test_a_validation_without_holes_is_an_error(tmp_path):
+    class Empty:
+        def scene(self, number):
+            return []
+
+    validation = HoleValidation(Empty(), 2, lambda model, sample: sample.view.rgb, "black")
+    with pytest.raises(ValueError, match="expected views with holes, got none in 100 scenes"):
+        validation(nn.Linear(1, 1), tmp_path / "shown.png")
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -27,7 +27,15 @@ from viewmend.training.config import TrainConfig
 from viewmend.training.depth_geometry import DepthErrors
 from viewmend.training.loop import train
 from viewmend.training.scenes import Scene, StudioRigs, rig_source
-from viewmend.training.shards import ShardScenes, sample_from_bytes, sample_to_bytes, write_shards
+from viewmend.training.shards import (
+    ShardError,
+    ShardScenes,
+    read_shard,
+    sample_from_bytes,
+    sample_to_bytes,
+    shards_of,
+    write_shards,
+)
 from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSceneMaker, store_scene
 from viewmend.training.views import (
     CROP_PX,
@@ -173,8 +181,28 @@ def test_views_behind_depth_maps_have_the_true_surface_and_its_errors(stored, vi
     assert int(((wrong.view.depth == 0) & (exact.view.depth > 0)).sum()) > 20, "it has holes"
 
 
+def test_errors_of_depth_maps_follow_from_the_number_of_the_scene(stored):
+    """Whatever else draws random numbers: other processes make the same samples."""
+
+    class Same:
+        def scene(self, number):
+            return [stored]
+
+    source = StoredSamples(Same(), replace(VIEWS_SAMPLING, depth_fraction=1.0), "0")
+    made = []
+    for number in (0, 0, 1):
+        torch.rand(1)
+        made.append([sample.view.depth for sample in source.scene(number)])
+    first, again, other = made
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert any(not torch.equal(a, b) for a, b in zip(first, other, strict=True))
+    errors = DepthErrors(noise_m=0.01)
+    generator = errors.generator()
+    one, two = (errors.apply(torch.ones(9, 9), generator) for _ in range(2))
+    assert not torch.equal(one, two), "each map has noise of its own"
+
+
 def test_drawn_errors_are_of_all_kinds_and_some_have_none():
-    torch.manual_seed(0)
     drawn = [DepthErrors.draw(Random(n)) for n in range(200)]
     assert 40 < drawn.count(DepthErrors()) < 100
     for name in ("bias_m", "noise_m", "waves_m", "step_m", "smooth_px", "grow_px", "holes"):
@@ -182,7 +210,7 @@ def test_drawn_errors_are_of_all_kinds_and_some_have_none():
     depth = torch.zeros(40, 30)
     depth[5:35, 5:25] = 2.0
     for errors in drawn:
-        found = errors.apply(depth)
+        found = errors.apply(depth, errors.generator())
         assert found.shape == depth.shape and bool(torch.isfinite(found).all()) and float(found.min()) >= 0
         assert float((found[found > 0] - 2).abs().median()) < 0.1
 
@@ -273,6 +301,26 @@ def test_holes_are_filled_by_the_ray_fill_of_another_model(stored, tmp_path):
     save_inpainter(ViewSynthNet(VIEWS_MODEL), tmp_path, "")
     with pytest.raises(ValueError, match="expected a model with a ray fill"):
         initial_model(replace(options, coarse_from=str(tmp_path)), "float32")
+
+
+@pytest.mark.parametrize(
+    ("has_units", "precision", "expected"),
+    [
+        (False, "bfloat16", torch.float32),
+        (True, "bfloat16", torch.bfloat16),
+        (True, "float32", torch.float32),
+    ],
+)
+def test_workers_fill_holes_in_a_precision_that_suits_the_cpu(
+    view_shards, monkeypatch, has_units, precision, expected
+):
+    """A run on a GPU is in bfloat16, but its samples are made on the CPU."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has_units})
+    run = RUN | {"precision": precision}
+    config = TrainConfig(name="views", objective=OPTIONS, shards=view_shards, **run)
+    objective = OPTIONS.make_objective(config, OPTIONS, None)
+    assert objective.training_scenes("0").net.compute_dtype == expected
+    assert objective.model.compute_dtype == (torch.bfloat16 if precision == "bfloat16" else torch.float32)
 
 
 @pytest.mark.parametrize(
@@ -399,6 +447,19 @@ def test_stored_scenes_are_numbered_through_all_shards(view_shards):
     made = {sample_to_bytes(scene[0]) for scene in scenes if scene}
     assert len(made) == 3
     assert {sample_to_bytes(s) for n in range(4, 8) for s in shards.scene(n)} == made
+
+
+def test_all_stored_scenes_are_used_if_the_first_shard_is_shorter(view_shards, tmp_path):
+    """As `make-dataset` leaves it when it is run again with a larger count."""
+    first, *others = [scene for path in shards_of(view_shards) for scene in read_shard(path)]
+    list(write_shards([first], tmp_path, shard_size=2))
+    list(write_shards(others, tmp_path, shard_size=2, first=1))
+    shards = ShardScenes(tmp_path, "0", StoredScene, whole=False)
+    made = {sample_to_bytes(scene) for number in range(4) for scene in shards.scene(number)}
+    assert made == {sample_to_bytes(scene) for scene in (first, *others)}
+    shards_of(tmp_path)[1].write_bytes(b"damaged")
+    with pytest.raises(ShardError, match=r"shard-00001\.tar: expected a tar of samples"):
+        ShardScenes(tmp_path, "0", StoredScene, whole=False)
 
 
 def training_views(view_shards, seed, net, **options):

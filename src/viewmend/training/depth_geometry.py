@@ -38,6 +38,8 @@ class DepthErrors:
     """Fraction of the pixels that remain, as squares of three pixels, like splatted points; 0 keeps all."""
     behind: bool = False
     """Whether a farther surface shows between the points, instead of none."""
+    seed: int = 0
+    """Seed of the random numbers of all maps of the scene."""
 
     @classmethod
     def draw(cls, random: Random) -> "DepthErrors":
@@ -59,10 +61,17 @@ class DepthErrors:
             holes=some(0.08),
             points=random.uniform(0.08, 0.4) if random.random() < 0.3 else 0.0,
             behind=random.random() < 0.5,
+            seed=random.getrandbits(32),
         )
 
-    def apply(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-        """A depth map, 0 where there is no surface, with these errors; noise comes from torch's global generator."""
+    def generator(self) -> torch.Generator:
+        """The random numbers of the scene's maps, to be passed to `apply` for one map after the other."""
+        return torch.Generator().manual_seed(self.seed)
+
+    def apply(
+        self, depth: Float[Tensor, "height width"], generator: torch.Generator
+    ) -> Float[Tensor, "height width"]:
+        """A depth map, 0 where there is no surface, with these errors."""
         there = depth > 0
         if self.smooth_px:
             depth = torch.where(there, _mean(depth, self.smooth_px), 0.0)
@@ -74,11 +83,13 @@ class DepthErrors:
             depth = torch.where(gone, 0.0, depth)
         there = depth > 0
         if self.holes:
-            spots = torch.rand(1, 1, *(-(-side // 5) for side in depth.shape)) < self.holes
+            sides = [-(-side // 5) for side in depth.shape]
+            spots = torch.rand(1, 1, *sides, generator=generator) < self.holes
             there = there & (F.interpolate(spots.float(), size=depth.shape, mode="bilinear")[0, 0] < 0.5)
-        depth = depth + self.bias_m + self.noise_m * torch.randn_like(depth)
+        depth = depth + self.bias_m + self.noise_m * torch.randn(depth.shape, generator=generator)
         if self.waves_m:
-            coarse = torch.randn(1, 1, *(-(-side // self.waves_px) + 1 for side in depth.shape))
+            sides = [-(-side // self.waves_px) + 1 for side in depth.shape]
+            coarse = torch.randn(1, 1, *sides, generator=generator)
             depth = depth + self.waves_m * F.interpolate(coarse, size=depth.shape, mode="bicubic")[0, 0]
         if self.step_m:
             depth = (depth / self.step_m).round() * self.step_m
@@ -86,7 +97,7 @@ class DepthErrors:
         if not self.points:
             return depth
         # Some of the pixels as squares; the nearest square wins.
-        kept = (depth > 0) & (torch.rand_like(depth) < self.points)
+        kept = (depth > 0) & (torch.rand(depth.shape, generator=generator) < self.points)
         nearest = -F.max_pool2d(-torch.where(kept, depth, torch.inf)[None], 3, 1, 1)[0]
         between = depth + 0.25 * (depth > 0) if self.behind else torch.zeros_like(depth)
         return torch.where(nearest.isinf(), between, nearest)

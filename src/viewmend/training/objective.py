@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count, islice
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -21,6 +20,7 @@ from viewmend.models.compositing import Background, composite
 from viewmend.models.network import set_compute_dtype
 from viewmend.training.adversarial import Adversary, Judged
 from viewmend.training.config import SceneSource, TrainConfig
+from viewmend.training.replay import first_samples
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.shards import ShardScenes
 from viewmend.utils.tensors import to_device
@@ -223,8 +223,7 @@ class HoleValidation:
         rows: list[Tensor] = []
         for suffix, source in sources.items():
             if suffix not in self._samples:
-                samples = (sample for number in count() for sample in source.scene(number))
-                self._samples[suffix] = list(islice(samples, self.num_views))
+                self._samples[suffix] = first_samples(source, self.num_views)
             pairs = torch.tensor([self._score(model, sample, rows) for sample in self._samples[suffix]])
             scores[f"holes{suffix}"], scores[f"telea{suffix}"] = pairs.mean(0).tolist()
         model.train(training)

@@ -135,7 +135,7 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
             empty = 0 if samples else empty + 1
             if empty == MAX_EMPTY_SCENES:
                 raise ValueError(
-                    f"expected views with holes to train on, got none in {empty} scenes; use rigs of fewer cameras, or "
+                    f"expected views with holes, got none in {empty} scenes; use rigs of fewer cameras, or "
                     "larger images"
                 )
             for index, sample in enumerate(samples):
@@ -143,3 +143,8 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
     finally:
         # An error that is raised refers to this frame, which must not keep the workers alive.
         del loaded, samples
+
+
+def first_samples(scenes: SceneSource[Item], number: int) -> list[Item]:
+    """The first samples of the scenes, made in this process; raises as `samples_in_order` does."""
+    return [sample for _, _, sample in islice(samples_in_order(scenes, 0, workers=0), number)]

@@ -124,7 +124,7 @@ class ShardScenes(Generic[Kind]):
         """Find the shards. A scene is a whole shard with its samples in random order, or a single item if not `whole`.
 
         Raises:
-            ShardError: there are none, or the first is damaged.
+            ShardError: there are none, or items are numbered and one shard is not a tar file.
         """
         self.paths = shards_of(folder)
         self.seed = seed
@@ -135,10 +135,10 @@ class ShardScenes(Generic[Kind]):
             raise ShardError(
                 f"{folder}: expected tar files, found none; write some with `viewmend make-dataset --out`"
             )
-        self._items = 1 if whole else len(read_shard(self.paths[0]))
+        self._items = 1 if whole else max(1, *map(_count_members, self.paths))
 
     def scene(self, number: int) -> list[Kind]:
-        """One shard; or one item, none where a shard has fewer than the first.
+        """One shard; or one item, none where a shard has fewer than the longest.
 
         Raises:
             ShardError: the shard is damaged, or holds another kind, or shorter clips.
@@ -161,6 +161,15 @@ class ShardScenes(Generic[Kind]):
                 "with `viewmend make-dataset RECIPE`"
             )
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
+
+
+def _count_members(path: Path) -> int:
+    """The number of samples in a shard, which are not read; ShardError if it is not a tar file."""
+    try:
+        with tarfile.open(path, "r:") as tar:
+            return len(tar.getmembers())
+    except (tarfile.TarError, OSError) as error:
+        raise ShardError(f"{path}: expected a tar of samples ({error}); write this shard again") from error
 
 
 def _write_shard(samples: list[object], path: Path) -> Path:

@@ -114,9 +114,11 @@ class StoredScene:
             cached = stream.add_frame(others, _proxy(view))
             rendered = stream.render(target)
         else:
-            maps = DepthMaps(frame.cameras.names, torch.stack([errors.apply(own) for own in depth]))
-            cached = CachedFrame(others, maps)
-            rendered, _ = render_depth(others, target, errors.apply(true_depth), cached.depth, render)
+            generator = errors.generator()
+            with_errors = torch.stack([errors.apply(own, generator) for own in depth])
+            cached = CachedFrame(others, DepthMaps(frame.cameras.names, with_errors))
+            own_depth = errors.apply(true_depth, generator)
+            rendered, _ = render_depth(others, target, own_depth, cached.depth, render)
         names = rendered.closest_views(num_ray_views)
         context = cached.context(names)
         assert context is not None, "a rig has cameras besides the held-out one"

@@ -8,7 +8,6 @@ depth; their views skip the terms that need it.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count, islice
 from pathlib import Path
 from random import Random
 from typing import Annotated, Literal
@@ -24,7 +23,7 @@ from viewmend.geometry.sampling import in_view
 from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, load_lpips
 from viewmend.models.checkpoint import load_inpainter, load_network
-from viewmend.models.network import set_compute_dtype
+from viewmend.models.network import faster_dtype, set_compute_dtype
 from viewmend.models.views.config import COLOUR, OFFSETS, ViewsConfig
 from viewmend.models.views.grid import CELL_PX, nearest_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
@@ -43,6 +42,7 @@ from viewmend.training.objective import (
     mean_loss,
     write_rows,
 )
+from viewmend.training.replay import first_samples
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import rig_source, validation_scenes
 from viewmend.training.shards import storable
@@ -141,6 +141,15 @@ def initial_model(config: "ViewsObjectiveConfig", precision: str) -> ViewSynthNe
         net.coarse.load_state_dict(weights)
     set_compute_dtype(net, torch.bfloat16 if precision == "bfloat16" else torch.float32)
     return net
+
+
+def filling_model(config: "ViewsObjectiveConfig", precision: str) -> ViewSynthNet:
+    """`initial_model` for filling the holes of training views, on the CPU, also if the run is on a GPU.
+
+    `precision` is that of the run; the CPU computes in bfloat16 only if that is faster.
+    """
+    is_faster = faster_dtype(torch.device("cpu")) == torch.bfloat16
+    return initial_model(config, precision if is_faster else "float32")
 
 
 @storable
@@ -291,7 +300,7 @@ class ViewsObjective(Objective[ViewSynthNet]):
     def training_scenes(self, seed: str) -> SceneSource[TrainingView]:
         """See `Objective.training_scenes`."""
         samples = StoredSamples(super().training_scenes(seed), self.options.sampling, seed)
-        return TrainingViews(samples, seed, initial_model(self.options, self.config.precision))
+        return TrainingViews(samples, seed, filling_model(self.options, self.config.precision))
 
     def forward(self, batch: Sequence[TrainingView]) -> StepOutput:
         """The mean terms of the batch."""
@@ -514,10 +523,9 @@ class ViewsValidation:
         scenes = validation_scenes(self.config.scenes, self.options.sampling)
         maker = StoredSceneMaker(scenes.rigs, scenes.config)
         samples = StoredSamples(maker, self.options.sampling, "validation")
-        net = initial_model(self.options, self.config.precision)
+        net = filling_model(self.options, self.config.precision)
         source = TrainingViews(samples, "validation", net, smooth_fill=0.0)
-        views = (view for number in count() for view in source.scene(number))
-        return list(islice(views, self.config.validation_views))
+        return first_samples(source, self.config.validation_views)
 
 
 def _score_view(
