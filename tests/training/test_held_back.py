@@ -29,7 +29,7 @@ from viewmend.training.held_back import (
     compare,
     held_back_views,
 )
-from viewmend.training.loop import train
+from viewmend.training.loop import RunClock, train
 from viewmend.training.scenes import rig_source
 from viewmend.training.views import ViewsObjectiveConfig
 
@@ -47,6 +47,10 @@ def test_the_middle_camera_and_the_last_tenth_are_held_back():
     assert HeldBack.of(one_frame, AUTO) == HeldBack("c2", 1)
     small = BallCapture(ring(4), frames=31)
     assert HeldBack.of(small, AUTO) == HeldBack(None, 27)
+    left = AwayBall(ring(4), 20, {18, 19})
+    assert HeldBack.of(left, AUTO) == HeldBack(None, 16), "a tenth of the frames with a subject"
+    assert HeldBack.of(AwayBall(ring(4), 20, {*range(1, 20)}), AUTO) == HeldBack(None, 1)
+    assert HeldBack.of(AwayBall(ring(4), 20, {*range(20)}), AUTO) == HeldBack(None, 18)
     with pytest.raises(CaptureError, match=r"--hold-out among c0, .*got 'front'"):
         HeldBack.of(capture, "front")
     with pytest.raises(CaptureError, match="at least 5 cameras to hold one back, got 4"):
@@ -111,11 +115,19 @@ def test_what_is_held_back_is_scored(place):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("cameras", [4, 5])
 @pytest.mark.parametrize("empty", [{19}, {18, 19}])
-def test_the_table_shows_the_subject_also_if_it_has_left(empty, tmp_path):
-    write_capture(AwayBall(ring(5), 20, empty), tmp_path / "ball", images="png")
-    views = list(held_back_views(tmp_path / "ball", AUTO, table=True))
-    assert len(views) == 5 and all(bool(view.truth.mask.any()) for view in views)
+def test_the_subject_is_shown_also_if_it_has_left(empty, cameras, tmp_path):
+    """Neither the validation of a small rig nor the table may use frames that were trained on."""
+    capture = AwayBall(ring(cameras), 20, empty)
+    write_capture(capture, tmp_path / "ball", images="png")
+    first = HeldBack.of(capture, AUTO).first_frame
+    table = list(held_back_views(tmp_path / "ball", AUTO, table=True))
+    assert len(table) == cameras and not any(view.trained_on for view in table)
+    validation = list(held_back_views(tmp_path / "ball", AUTO))
+    late = {view.truth.time for view in table + (validation if cameras == 4 else [])}
+    assert late and min(late) >= first and validation
+    assert all(bool(view.truth.mask.any()) for view in table + validation)
 
 
 @pytest.mark.slow
@@ -167,17 +179,15 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     scores = iter([1.0, 2.0, 2.05, 1.0, 1.2, 0.9, 0.8, 0.7, 0.6])
     monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": next(scores)})
     monkeypatch.setattr("viewmend.training.loop.PATIENCE", 3)
-    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
-    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
-    run = RUN | {"steps": 40, "validate_every": 1, "ema": 0.0}
-    config = TrainConfig(name="finetune", objective=options, scenes=scenes, **run)
+    monkeypatch.setattr(RunClock, "elapsed_s", lambda self: 300.0)
+    config = finetuning(place, steps=40, validate_every=1)
     kept = []
     out = train(config, tmp_path / "run", report=lambda _: kept.append(first_weight(tmp_path / "run")))
     assert max(entry["step"] for entry in log_of(out)) == 4, "three validations after the best one"
     assert all(float(value) == float(kept[0]) for value in kept), (
         "step 1 was the best: step 2 gained too little"
     )
-    assert "1 steps of" in (out / "README.md").read_text()
+    assert "1 steps of 2 samples\nx 1 streams in 5 minutes" in (out / "README.md").read_text()
     train(config, out)
     assert float(first_weight(out)) == float(kept[0]), "a finished run stays as it is"
 
@@ -187,10 +197,7 @@ def test_a_resumed_run_knows_the_score_of_its_last_steps(place, tmp_path, monkey
         [1.0, 1.0, 3.0, 2.0, 2.0]
     )  # at the start, after step 2, at the end, then of the resumed run
     monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": next(scores)})
-    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
-    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
-    run = RUN | {"steps": 3, "validate_every": 2, "ema": 0.0}
-    config = TrainConfig(name="finetune", objective=options, scenes=scenes, **run)
+    config = finetuning(place, steps=3, validate_every=2)
     out = train(config, tmp_path / "run")
     best = float(first_weight(out))
     train(replace(config, steps=5), out)
@@ -198,11 +205,49 @@ def test_a_resumed_run_knows_the_score_of_its_last_steps(place, tmp_path, monkey
     assert float(first_weight(out)) == best, "the weights of step 3 scored more than those of steps 4 and 5"
 
 
+def test_a_run_that_was_killed_while_its_last_steps_were_scored_scores_them_later(
+    place, tmp_path, monkeypatch
+):
+    scores = iter([1.0, 1.0, None, 3.0])
+
+    def score(*_):
+        found = next(scores)
+        if found is None:
+            raise KeyboardInterrupt
+        return {"score": found}
+
+    monkeypatch.setattr(HeldBackValidation, "__call__", score)
+    config = finetuning(place, steps=3, validate_every=2)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path)
+    first = float(first_weight(tmp_path))
+    train(config, tmp_path)
+    assert [entry["step"] for entry in log_of(tmp_path) if "validation" in entry] == [0, 2, 3]
+    assert float(first_weight(tmp_path)) != first
+    train(config, tmp_path)
+    assert next(scores, None) is None, "nothing is scored twice"
+
+
+def test_a_run_that_is_validated_only_when_resumed_goes_on(place, tmp_path, monkeypatch):
+    monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": 1.0})
+    monkeypatch.setattr("viewmend.training.loop.PATIENCE", 1)
+    train(finetuning(place, steps=2, validate_every=0), tmp_path)
+    train(finetuning(place, steps=4, validate_every=1), tmp_path)
+    assert [entry["step"] for entry in log_of(tmp_path) if "losses" in entry] == [1, 2, 3, 4]
+
+
 def test_a_run_without_captures_holds_nothing_back(tmp_path):
     options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
     run = RUN | {"steps": 1, "validate_every": 1}
     config = TrainConfig(name="finetune", objective=options, scenes=replace(SCENES, hold_out=AUTO), **run)
     assert (train(config, tmp_path / "run") / "README.md").exists()
+
+
+def finetuning(place, **changes):
+    """Fine-tuning of a tiny model on a capture."""
+    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
+    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
+    return TrainConfig(name="finetune", objective=options, scenes=scenes, **RUN | {"ema": 0.0} | changes)
 
 
 def first_weight(folder):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from torch import nn
 from training.conftest import log_of
 
 from viewmend.models.base import ContextProvider
@@ -15,9 +16,9 @@ from viewmend.models.checkpoint import load_network
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import composite
 from viewmend.models.paper.patch_transformer import PatchTransformer
-from viewmend.training.loop import Run, RunClock, averaging, join_processes, train
+from viewmend.training.loop import Processes, Run, RunClock, averaging, join_processes, train
 from viewmend.training.paper import PaperObjective
-from viewmend.training.run_files import CHECKPOINT, RunError
+from viewmend.training.run_files import CHECKPOINT, RunError, RunState, load_run, save_run
 from viewmend.training.samples import true_image
 from viewmend.training.shards import sample_from_bytes
 
@@ -114,12 +115,52 @@ def test_a_run_that_is_stopped_loses_no_step(tiny, whole, tmp_path):
 def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path):
     train(replace(tiny, steps=1), tmp_path)
     other = with_options(replace(tiny, batch=3, learning_rate=1.0), adversarial=0.5)
-    with pytest.raises(RunError, match=r"differs in objective\.adversarial, batch, learning_rate"):
+    with pytest.raises(RunError, match=r"differs in objective\.adversarial, batch;"):
         train(with_options(other, adversarial=0.5), tmp_path)
     whole = (tmp_path / CHECKPOINT).read_bytes()
     (tmp_path / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RunError, match=r"run\.safetensors: expected a run to resume"):
         train(tiny, tmp_path)
+
+
+def test_a_run_may_go_on_with_a_lower_learning_rate(tiny, tmp_path):
+    """As the messages advise after a loss that is not finite."""
+    train(replace(tiny, steps=2), tmp_path)
+    train(replace(tiny, steps=4, learning_rate=1e-6), tmp_path)
+    rates = [entry["learning_rate"] for entry in log_of(tmp_path)]
+    assert len(rates) == 4 and 0 < max(rates[2:]) <= 1e-6 < min(rates[:2])
+
+
+def test_processes_resume_only_from_the_same_checkpoint(tiny, tmp_path):
+    class WithAnother(Processes):
+        """This process, and one that found no checkpoint."""
+
+        def maximum(self, *values):
+            return [max(value, 0.0) for value in values]
+
+    own = WithAnother(0, 1, torch.device("cpu"))
+    assert Run(tiny, tmp_path, None, own).state.step == 0
+    train(replace(tiny, steps=1), tmp_path)
+    with pytest.raises(ValueError, match="same checkpoint in all processes, got steps 0 to 1"):
+        Run(tiny, tmp_path, None, own)
+
+
+def test_parameters_without_a_gradient_need_no_moments_to_resume(tiny, tmp_path):
+    """E2FGVI on single views never uses some of its layers."""
+
+    def make():
+        net = nn.ModuleDict({"used": nn.Linear(2, 2), "unused": nn.Linear(2, 2)})
+        return net, torch.optim.Adam(net.parameters())
+
+    net, optimizer = make()
+    net["used"](torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    state = RunState(step=1, elapsed_s=0.0, positions=())
+    save_run(tmp_path, tiny, state, {"model": net}, {"optimizer": optimizer})
+    other, other_optimizer = make()
+    found = load_run(tmp_path / CHECKPOINT, tiny, {"model": other}, {"optimizer": other_optimizer})
+    assert found == state and torch.equal(other["used"].weight, net["used"].weight)
+    assert other_optimizer.state_dict()["state"].keys() == {0, 1}
 
 
 @pytest.mark.parametrize(("has_units", "precision"), [(True, torch.bfloat16), (False, torch.float32)])
@@ -139,7 +180,7 @@ def test_automatic_precision_is_the_faster_one_and_a_run_resumes_where_the_other
 def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, whole, tmp_path, every_two):
     train(tiny, tmp_path / "parts")
     (tmp_path / "parts" / CHECKPOINT).write_bytes(b"damaged")
-    with pytest.raises(RunError, match=r"rename run\.previous\.safetensors to it"):
+    with pytest.raises(RunError, match="remove the file to resume from the checkpoint before"):
         train(tiny, tmp_path / "parts")
     (tmp_path / "parts" / CHECKPOINT).unlink()
     reported = []

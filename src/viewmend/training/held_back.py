@@ -57,17 +57,19 @@ class HeldBack:
     camera: str | None
     """None if the rig has fewer than `MIN_CAMERAS`, or is listed in a splits file."""
     first_frame: int
-    """The first frame that training never uses; 1 if the capture has only frame 0, which training uses."""
+    """The first frame that training never uses; 1 if only frame 0 shows a subject, which training uses."""
 
     @classmethod
     def of(cls, capture: CaptureSource, camera: str | None) -> "HeldBack":
         """Hold back this camera and the last frames; `AUTO` chooses the middle one of the cameras that see the subject.
 
+        The last frames are a tenth of those up to the last one with a subject, and all after it.
+
         Raises:
             CaptureError: there is no such camera, or too few others.
         """
         names = capture.cameras.names
-        count = len(capture.frame_ids)
+        count = _end_of_subject(capture)
         first_frame = count - math.ceil(TAIL * count) if count > 1 else 1
         if camera is None:
             return cls(None, first_frame)
@@ -95,6 +97,12 @@ class HeldBack:
         what = " and ".join(parts) or "nothing"
         verb = "are" if len(parts) > 1 or (self.camera is None and late > 1) else "is"
         return f"{capture.name}: {what} {verb} held out, for validation only"
+
+
+def _end_of_subject(capture: CaptureSource) -> int:
+    """The number of frames up to the last one that shows the subject; of all frames if none does."""
+    count = len(capture.frame_ids)
+    return next((time + 1 for time in reversed(range(count)) if capture.read(time).has_subject), count)
 
 
 def _middle_camera(capture: CaptureSource) -> str:
@@ -225,7 +233,7 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
 
 def _views_of(capture: CaptureFolder, held_back: HeldBack, table: bool) -> Iterator[HeldBackView]:
     names = capture.cameras.names
-    count = len(capture.frame_ids)
+    count = _end_of_subject(capture)
     late = range(held_back.first_frame, count) if count > 1 else range(1)
 
     # Cameras and frames to render
@@ -255,21 +263,15 @@ def _views_of(capture: CaptureFolder, held_back: HeldBack, table: bool) -> Itera
             continue
         scene = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
-        trained_on = camera != held_back.camera and count == 1
+        trained_on = camera != held_back.camera and time < held_back.first_frame
         yield HeldBackView(camera, trained_on, stream.add_frame(scene.inputs), scene.truth)
 
 
 def _time_with_subject(capture: CaptureFolder, late: range) -> int:
-    """The frame nearest to the middle of those held back that has a subject, or else the last one before them.
-
-    Without any, the middle one.
-    """
+    """The frame nearest to the middle of those held back that has a subject; without any, the middle one."""
     middle = late[len(late) // 2]
-    held = sorted(late, key=lambda time: abs(time - middle))
-    for time in (*held, *reversed(range(late.start))):
-        if capture.read(time).has_subject:
-            return time
-    return middle
+    nearest_first = sorted(late, key=lambda time: abs(time - middle))
+    return next((time for time in nearest_first if capture.read(time).has_subject), middle)
 
 
 @dataclass
@@ -288,7 +290,10 @@ class HeldBackValidation:
         if not self._views:
             self._views = [view for place in self.captures for view in held_back_views(place, self.hold_out)]
         if not self._views:
-            raise ValueError("expected a subject in what is held back, got none; choose another --hold-out")
+            raise ValueError(
+                "expected a subject in what is held back, got none; choose another --hold-out, or cut the frames "
+                "without a subject at the end"
+            )
         self._metric = self._metric or load_lpips("alex")
         training = model.training
         model.eval()

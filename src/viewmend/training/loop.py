@@ -27,6 +27,7 @@ from viewmend.training.run_files import (
     last_checkpoint,
     load_run,
     model_card,
+    read_validations,
     save_run,
 )
 from viewmend.training.shards import sample_to_bytes
@@ -279,10 +280,21 @@ class Run:
         last = last_checkpoint(out)
         if last:
             self.state = load_run(last, config, self._modules, self._optimizers)
+        self._check_same_checkpoint()
         self.ddp_objective = processes.wrap_ddp(self.objective)
         self.streams = self._make_streams()
         self.keeps_best = bool(config.scenes.hold_out and config.scenes.captures and config.validate_every)
         self.validation = self._make_validation()
+
+    def _check_same_checkpoint(self) -> None:
+        """Raise ValueError unless all processes resume from the same step."""
+        step = float(self.state.step)
+        minus_first, last = map(int, self.processes.maximum(-step, step))
+        if last != -minus_first:
+            raise ValueError(
+                f"{self.out}: expected the same checkpoint in all processes, got steps {-minus_first} to {last}; "
+                "use a folder that all machines share"
+            )
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
@@ -294,7 +306,7 @@ class Run:
             # Score the starting weights if they may be the best, or are the baseline for later scores
             scores_start = self.keeps_best or self.objective.scores_training_views
             if step == 0 and self.validation is not None and scores_start:
-                self._validate(log, step)
+                self._validate(log, step, clock)
             while True:
                 # One process that is done ends the run for all, and one that wants a checkpoint makes all save
                 ends_now = stopped() or self._has_stopped_improving(step)
@@ -333,15 +345,15 @@ class Run:
                 )
                 log.add(entry)
                 if self.validation is not None and step % config.validate_every == 0:
-                    self._validate(log, step)
+                    self._validate(log, step, clock)
                 yield entry
             if step > self.state.step:
                 self._save(step, clock)
             elif self.processes.is_first and not self.keeps_best:
-                self._write_model()  # the run was complete already, but its model may have been removed
+                self._write_model(self.state)  # the run was complete already, but its model may be missing
 
             # The last steps have just been saved. Only then are they validated, because that takes long
-            if config.validate_every and step > first_step and step % config.validate_every != 0:
+            if config.validate_every:
                 self._validate_last_steps(log, step, clock)
 
     def _make_validation(self) -> Validation | None:
@@ -362,7 +374,7 @@ class Run:
         """The model with averaged weights, which is the result."""
         return self.average.module
 
-    def _validate(self, log: Log, step: int) -> None:
+    def _validate(self, log: Log, step: int, clock: RunClock) -> None:
         """Score and log the averaged weights. A run that keeps the best writes them if their score is the best."""
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
@@ -375,16 +387,20 @@ class Run:
         best = self.state.best_score
         if self.keeps_best and score is not None and is_better(score, best):
             self.state = replace(self.state, best_score=score, best_step=step)
-            self._write_model(step)
+            self._write_model(replace(self.state, step=step, elapsed_s=clock.elapsed_s()))
 
     def _validate_last_steps(self, log: Log, step: int, clock: RunClock) -> None:
         """Validate the last weights; if they are the best, save again, because a checkpoint holds the best score.
 
-        Every process calls this: only the first validates, but all take part in saving.
+        If a run that keeps the best weights was killed here, it catches up when it is resumed. Every process
+        calls this: only the first validates, but all take part in saving.
         """
-        if self.validation is not None:
-            self._validate(log, step)
-        has_better_weights = float(self.keeps_best and self.state.best_step == step)
+        has_better_weights = 0.0
+        if self.validation is not None and (step > clock.first_step or self.keeps_best):
+            scored_steps = [scored for scored, _ in read_validations(self.out)]
+            if step not in scored_steps:
+                self._validate(log, step, clock)
+                has_better_weights = float(self.keeps_best and self.state.best_step == step)
         (any_has_better_weights,) = self.processes.maximum(has_better_weights)
         if any_has_better_weights:
             self._save(step, clock)
@@ -401,8 +417,10 @@ class Run:
 
     def _has_stopped_improving(self, step: int) -> bool:
         """Whether a run that keeps the best weights found no better ones in the last `PATIENCE` validations."""
+        if not self.processes.is_first or not self.keeps_best or self.state.best_score is None:
+            return False
         waited = step - self.state.best_step
-        return self.processes.is_first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
+        return waited >= PATIENCE * self.config.validate_every
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """Update all weights once, by the mean gradient over the samples of all streams."""
@@ -509,15 +527,14 @@ class Run:
         if self.processes.is_first:
             save_run(self.out, self.config, self.state, self._modules, self._optimizers)
             if not self.keeps_best:
-                self._write_model()
+                self._write_model(self.state)
         clock.note_checkpoint()
 
-    def _write_model(self, step: int | None = None) -> None:
-        """Write the averaged weights, with a card that names their step: that of the state by default."""
-        state = self.state if step is None else replace(self.state, step=step)
-        self.objective.save(
-            self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary)
-        )
+    def _write_model(self, state: RunState) -> None:
+        """Write the averaged weights, with a card that states the steps and the time of `state`."""
+        num_streams = len(self.streams) * self.processes.count
+        card = model_card(self.config, state, num_streams, self.objective.loss_summary)
+        self.objective.save(self.averaged, self.out, card)
 
 
 def memorised_gain(scores: Mapping[str, float | None], first: Mapping[str, float | None]) -> float | None:

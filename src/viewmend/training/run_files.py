@@ -29,6 +29,7 @@ MAY_CHANGE = (
     "checkpoint_minutes",
     "validate_every",
     "validation_views",
+    "learning_rate",
 )
 """Fields of the config that may differ when a run is resumed."""
 
@@ -152,8 +153,8 @@ def load_run(
 def _advice(path: Path) -> str:
     if path.name == CHECKPOINT and path.with_name(PREVIOUS_CHECKPOINT).exists():
         return (
-            f"remove the file to start again, or rename {PREVIOUS_CHECKPOINT} to it to resume from the checkpoint "
-            "before"
+            f"remove the file to resume from the checkpoint before, {PREVIOUS_CHECKPOINT}, or remove both to "
+            "start again"
         )
     return "remove the file to start again"
 
@@ -171,9 +172,8 @@ def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
         states.setdefault(int(number), {})[key] = value
     groups = optimizer.state_dict()["param_groups"]
     count = sum(len(group["params"]) for group in groups)
-    if states and (
-        set(states) != set(range(count)) or len({frozenset(state) for state in states.values()}) > 1
-    ):
+    # Parameters that never had a gradient have no moments
+    if not states.keys() <= set(range(count)) or len({frozenset(state) for state in states.values()}) > 1:
         raise ValueError(f"moments of {len(states)} parameters for {count}")
     optimizer.load_state_dict({"state": states, "param_groups": groups})
 
@@ -270,7 +270,7 @@ def _is_later(line: str, step: int) -> bool:
         return False
 
 
-def model_card(config: TrainConfig, state: RunState, loss_summary: str) -> str:
+def model_card(config: TrainConfig, state: RunState, num_streams: int, loss_summary: str) -> str:
     """The README.md of trained weights, in Markdown: how they were trained; scores are added by hand."""
     hardware = (
         torch.cuda.get_device_name()
@@ -282,7 +282,7 @@ def model_card(config: TrainConfig, state: RunState, loss_summary: str) -> str:
     return f"""# {config.name}
 
 Trained by `viewmend train {config.name}` from {start}: {state.step} steps of {config.batch} samples
-x {len(state.positions)} streams in {state.elapsed_s / 60:.0f} minutes, learning rate {config.learning_rate:g},
+x {num_streams} streams in {state.elapsed_s / 60:.0f} minutes, learning rate {config.learning_rate:g},
 seed {config.seed}, torch {torch.__version__}, {hardware}.
 Loss: {loss_summary}{averaged}.
 Data: {_data_summary(config)}; no test seeds, performers or motions.

@@ -150,7 +150,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     if broken:
         raise FloatingPointError(
             f"{path}: expected finite values, got NaN or infinity in {len(broken)} of {len(plain)} tensors "
-            f"({broken[0]}); the file is unchanged: resume from it with a lower learning rate"
+            f"({broken[0]}); nothing was written: resume from the last checkpoint with a lower learning rate"
         )
 
     def write(temporary: Path) -> None:
