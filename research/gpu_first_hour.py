@@ -48,6 +48,8 @@ GRACE_S = 60.0
 PIECE_BYTES = 16 * 2**20
 SHARES = {"windows": 0.2, "autoencoder-small": 0.08, "paper-small": 0.27, "autoencoder": 0.1, "paper": 0.35}
 """Fractions of the time for training."""
+OUT_OF_TIME = "out of time"
+"""The code of a step that had to be ended."""
 SAID = 3000
 """Characters of a step's output that are kept."""
 
@@ -178,13 +180,19 @@ def run(command: list[str], limit_s: float) -> dict[str, object]:
             killer.start()
             said, wrong = process.communicate()
             killer.cancel()
-            code = "out of time"
+            code = OUT_OF_TIME
     result: dict[str, object] = {"code": code, "seconds": round(time.monotonic() - began, 1)}
     with contextlib.suppress(ValueError, IndexError):
         result["figures"] = json.loads(said.strip().splitlines()[-1])
     if "figures" not in result or code != 0:
         result |= {"stdout": said[-SAID:], "stderr": wrong[-SAID:]}
     return result
+
+
+def failed(steps: dict[str, dict[str, object]]) -> list[str]:
+    """The names of the steps that failed. `windows` makes as many as it can, so its time is always over."""
+    accepted = {"windows": (0, OUT_OF_TIME), "tests": (0, 5)}  # pytest's 5: there are none
+    return [name for name, step in steps.items() if step["code"] not in accepted.get(name, (0,))]
 
 
 def main() -> None:
@@ -221,7 +229,7 @@ def main() -> None:
         if name not in given.skip:
             step(name, command, 60 * SHARES[name] * left + (0 if name == "windows" else GRACE_S))
             write_pieces(given.out)
-    sys.exit(any(one["code"] not in (0, 5) for one in report["steps"].values()))
+    sys.exit(bool(failed(report["steps"])))
 
 
 if __name__ == "__main__":

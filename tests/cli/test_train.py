@@ -54,6 +54,24 @@ def test_the_help_names_every_recipe(capsys):
     assert words >= set(RECIPES)
 
 
+@pytest.mark.parametrize("rank", [0, 1])
+def test_only_the_first_process_speaks_and_counts_no_steps_that_it_did_not_make(
+    rank, tmp_path, capsys, monkeypatch
+):
+    def train(*_, **__):
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("viewmend.training.loop.train", train)
+    monkeypatch.setattr("viewmend.cli.console.INTERVAL_S", 0.01)
+    monkeypatch.setenv("RANK", str(rank))
+    assert main(["train", "rays", "--out", str(tmp_path)]) == 128 + signal.SIGTERM
+    said = capsys.readouterr().err
+    assert ("making the first samples" in said) == (rank == 0)
+    assert (f"{tmp_path}: stopped; run the same command to resume" in said) == (rank == 0)
+    assert "step 0" not in said
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["views", "paper"])
 def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, tmp_path, capsys):

@@ -7,7 +7,7 @@ from studio.tiny_performer import BVH_JOINTS, JOINTS, write_character, write_mot
 from viewmend.data.errors import CaptureError
 from viewmend.studio.bvh import read_bvh
 from viewmend.studio.gltf import load_character
-from viewmend.studio.gltf_performer import GltfPerformer
+from viewmend.studio.gltf_performer import ROAM_M, SLOW_S, GltfPerformer, _stage_shift
 from viewmend.studio.retarget import (
     PARTS,
     REQUIRED,
@@ -168,6 +168,23 @@ def test_a_clip_runs_back_and_forth_past_its_end(character_file, motion_file):
     step = performer.motion.seconds_per_frame
     turned = performer.pose(4 * step).mesh.vertices
     torch.testing.assert_close(turned, performer.pose(2 * step).mesh.vertices, atol=1e-5, rtol=0)
+
+
+def test_a_path_of_any_length_is_smoothed(motion_file):
+    motion = replace(read_bvh(motion_file), seconds_per_frame=1 / 60)
+    path = torch.cumsum(0.02 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), 0)
+    for count in (1, 2, 40, 500):
+        flat = path[:count].double() * torch.tensor([1.0, 0.0, 1.0])
+        times_s = torch.arange(count) / 60.0
+        weights = torch.exp(-0.5 * ((times_s[:, None] - times_s) / SLOW_S) ** 2).double()
+        slow = weights @ flat / weights.sum(1, keepdim=True)
+        away = slow - slow[count // 2]
+        distance = away.norm(dim=1, keepdim=True).clamp(min=1e-6)
+        expected = away / distance * ROAM_M * torch.tanh(distance / ROAM_M) - slow
+        found = _stage_shift(path[:count], motion, count // 2 / 60)
+        torch.testing.assert_close(found, expected.float(), atol=1e-6, rtol=1e-6)
+    hour = _stage_shift(torch.zeros(216_000, 3), motion, 0.0)  # a matrix of all pairs would take 187 GB
+    assert not hour.any()
 
 
 def test_a_performer_stands_on_the_floor_near_the_centre(character_file, tmp_path):

@@ -82,6 +82,7 @@ def check_scenes(scenes: SceneConfig) -> None:
 def run(options: Options) -> int:
     """Train, with a line of progress every half minute; Ctrl-C and SIGTERM end the run with a checkpoint."""
     import os
+    from contextlib import nullcontext
 
     from viewmend.cli.console import Heartbeat, say, stop_requests
     from viewmend.training.loop import train
@@ -96,15 +97,16 @@ def run(options: Options) -> int:
         _announce_held_out(options.config)
     began_s = time.monotonic()
     heartbeat = Heartbeat(lambda: _line(steps[0]) if steps else "making the first samples")
-    with heartbeat, stop_requests() as stopped:
+    with heartbeat if first else nullcontext(), stop_requests() as stopped:
         try:
             train(options.config, options.out, report=report, stopped=lambda: stopped() > 0)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
     trained_s = time.monotonic() - began_s
     if number := stopped():
-        done = steps[0].step if steps else 0
-        say(f"{options.out}: stopped after step {done}; run the same command to resume")
+        if first:
+            done = f" after step {steps[0].step}" if steps else ""
+            say(f"{options.out}: stopped{done}; run the same command to resume")
         return 128 + number
     if first:
         say(f"wrote {options.out}" if steps else f"{options.out}: this run is complete; nothing to do")

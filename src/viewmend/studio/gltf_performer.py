@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,6 +19,8 @@ ROAM_M = 0.7
 """Largest distance of the slow part of a path from the stage's centre, metres."""
 SLOW_S = 0.8
 """Standard deviation of the Gaussian that splits a path into a slow and a fast part."""
+CUT = 7.0
+"""The Gaussian ends at this many standard deviations, where it is below 1e-10 of its peak."""
 FLOOR_SAMPLES = 16
 FLIGHT_M = 0.03
 """Soles this many metres above their lowest few per cent are in flight, not on the floor."""
@@ -96,15 +99,24 @@ class GltfPerformer:
         return float(torch.minimum(heights.quantile(0.5), heights.quantile(0.05) + FLIGHT_M))
 
 
+def _smooth(path: Float[Tensor, "frame 3"], sigma: float) -> Float[Tensor, "frame 3"]:
+    """The Gaussian mean around each frame, of the frames that exist; `sigma` in frames."""
+    from scipy.ndimage import gaussian_filter1d
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter1d(values, sigma, axis=0, mode="constant", truncate=CUT)
+
+    weights = blur(np.ones((len(path), 1)))
+    return torch.from_numpy(blur(path.double().numpy()) / weights).float()
+
+
 def _stage_shift(path: Float[Tensor, "frame 3"], motion: Motion, middle_s: float) -> Float[Tensor, "frame 3"]:
     """Compute the offset of each frame that keeps a path near the stage's centre; y is 0.
 
     The slow part of the path, seen from where it is at `middle_s`, is squeezed into a disc of `ROAM_M`.
     """
     flat = path * torch.tensor([1.0, 0.0, 1.0])
-    steps = torch.arange(len(flat), dtype=torch.float32) * motion.seconds_per_frame
-    kernel = torch.exp(-0.5 * ((steps[:, None] - steps[None]) / SLOW_S) ** 2)
-    slow = kernel @ flat / kernel.sum(1, keepdim=True)
+    slow = _smooth(flat, SLOW_S / motion.seconds_per_frame)
     from_middle = slow - slow[min(round(middle_s / motion.seconds_per_frame), len(slow) - 1)]
     distance = from_middle.norm(dim=1, keepdim=True).clamp(min=1e-6)
     squeezed = from_middle / distance * ROAM_M * torch.tanh(distance / ROAM_M)

@@ -66,7 +66,7 @@ class SceneConfig:
     'auto' chooses a camera in rigs of five or more."""
     protocols: tuple[Literal["strict", "target-mask", "hull-with-target-mask"], ...] = ("strict",)
     """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for
-    each camera."""
+    each camera, or for each rig of `paper-small`."""
     captures_fraction: float = 0.75
     """Fraction of the scenes that come from the captures, if any are given; the rest come from the studio."""
     hull_resolution: Annotated[int, HIDDEN] = 96
