@@ -187,11 +187,12 @@ def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monke
     assert "viewmend[all]" in capsys.readouterr().err
 
 
-def test_a_missing_compiler_is_said(tmp_path, capsys, monkeypatch):
+def test_a_missing_compiler_is_said(tmp_path, capsys):
     from torch._inductor import config
 
-    monkeypatch.setattr(config.cpp, "cxx", (None, "no-such-compiler"))
-    assert main(["export", "views", "--format", "pt2", "--out", str(tmp_path / "m.pt2")]) == 2
+    # monkeypatch would leave the setting deleted
+    with config.patch({"cpp.cxx": (None, "no-such-compiler")}):
+        assert main(["export", "views", "--format", "pt2", "--out", str(tmp_path / "m.pt2")]) == 2
     assert "expected a C++ compiler for --format pt2, found none" in capsys.readouterr().err
 
 
