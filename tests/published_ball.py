@@ -21,7 +21,7 @@ def publish_ball(
     config = PublishConfig(title="A <ball>", max_mb=max_mb, completed_cameras=completed_cameras, fps=10.0)
     read = (capture.read(time) for time in range(frames))
     out.mkdir(parents=True)
-    return publish(read, frames, stream, first, capture.up, out, config)
+    return publish(read, frames, stream, first, capture.cameras, capture.up, out, config)
 
 
 @pytest.fixture(scope="session")

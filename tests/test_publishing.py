@@ -140,16 +140,30 @@ def test_frames_of_one_camera_are_skipped(tmp_path, capsys):
         sorted((capture / "image" / name).iterdir())[0].unlink()
     arguments = [str(capture), "--model", "telea", "--geometry", "hull"]
     assert main(["publish", *arguments, str(tmp_path / "page"), "--completed-cameras", "0"]) == 0
-    said = "1 of 3 frames have fewer than two usable cameras and were skipped; the first is '000'"
+    said = (
+        "1 of 3 frames have fewer than two usable cameras and were skipped, which shortens the result; "
+        "the first is '000'"
+    )
     assert said in capsys.readouterr().err
     assert json.loads((tmp_path / "page/scene.json").read_text())["frames"] == 2
-    assert main(["export-scene", *arguments, str(tmp_path / "scene"), "--views", "1"]) == 0
+    assert main(["export-scene", *arguments, str(tmp_path / "scene"), "--views", "1", "--fps", "29.97"]) == 0
     assert said in capsys.readouterr().err
     assert len(list((tmp_path / "scene/hull").glob("*.glb"))) == 2
+    assert "timeCodesPerSecond = 29.97\n" in (tmp_path / "scene/cameras.usda").read_text()
     for command in ("publish", "export-scene"):
         assert main([command, *arguments, str(tmp_path / command), "--frames", "0:1"]) == 2
         assert "ball: expected a frame with two usable cameras, got none" in capsys.readouterr().err
         assert not (tmp_path / command).exists()
+
+
+def test_a_camera_without_an_image_in_the_first_frame_belongs_to_the_rig(tmp_path):
+    capture = tmp_path / "ball"
+    write_capture(BallCapture(CAMERAS, 2), capture, images="png")
+    sorted((capture / "image" / CAMERAS.names[-1]).iterdir())[0].unlink()
+    arguments = [str(capture), str(tmp_path / "page"), "--model", "telea", "--geometry", "hull"]
+    assert main(["publish", *arguments, "--completed-cameras", "0"]) == 0
+    rig = json.loads((tmp_path / "page/scene.json").read_text())["rig"]
+    assert [camera["name"] for camera in rig["cameras"]] == list(CAMERAS.names)
 
 
 @pytest.mark.parametrize("command", ["publish", "export-scene"])

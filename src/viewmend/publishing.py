@@ -193,6 +193,7 @@ def publish(
     count: int,
     stream: Stream,
     first: CachedFrame,
+    rig: Cameras,
     up: Float[Tensor, "3"] | None,
     out: Path,
     config: PublishConfig,
@@ -205,6 +206,7 @@ def publish(
         stream: computes the geometry and completes views.
         first: a frame of the stream that shows the subject; the initial view looks at it, and the
             poster shows it.
+        rig: the capture's cameras, also those without an image in the first frame.
         up: the capture's up direction; None to estimate it from the cameras.
         out: the folder.
         config: what the folder contains.
@@ -213,7 +215,7 @@ def publish(
         ValueError: the files do not fit into the size limit, or no frame shows a subject.
         OSError: a file cannot be written.
     """
-    rig = first.frame.cameras.to("cpu")
+    rig = rig.to("cpu")
     assert isinstance(first.proxy, GeometryProxy), "streams compute hulls"
     home = home_view(rig, first.proxy.center, up)
     poses: Cameras | None = None

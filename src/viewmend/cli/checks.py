@@ -83,6 +83,12 @@ def check_least(options: object, **least: int) -> None:
             )
 
 
+def check_fps(fps: float | None) -> None:
+    """Raise a ValueError for an option --fps that is out of range."""
+    if fps is not None and not 0 < fps <= 240:
+        raise ValueError(f"expected --fps above 0 and at most 240, got {fps}; choose again")
+
+
 def check_device(name: str) -> None:
     """Raise a ValueError unless this device exists."""
     import torch
@@ -175,7 +181,10 @@ def with_two_cameras(
         )
     if skipped:
         number = f"{len(skipped)} of {count} frames"
-        say(f"{number} have fewer than two usable cameras and were skipped; the first is '{skipped[0]}'")
+        say(
+            f"{number} have fewer than two usable cameras and were skipped, which shortens the result; "
+            f"the first is '{skipped[0]}'"
+        )
 
 
 def without_subject(source: "CaptureSource", times: Collection[int], count: int) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from viewmend.cli.checks import Geometry, Precision, PreparationOptions, check_least
+from viewmend.cli.checks import Geometry, Precision, PreparationOptions, check_fps, check_least
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ class Options:
     """Frames to export, as FIRST:END by index; either may be omitted."""
     max_image_size: int | None = None
     """Downscale images to at most this longer side, in pixels; views around the subject get the same size."""
+    fps: float | None = None
+    """Frames per second; by default those of the capture, or 15."""
     model: str | None = None
     """Name of a shipped model, a model's folder, or any method of `viewmend evaluate`."""
     min_confidence: float = 0.5
@@ -60,10 +62,12 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; the exit code."""
     check_least(options, views=1)
+    check_fps(options.fps)
     if not 0 <= options.min_confidence <= 1:
         raise ValueError(f"expected --min-confidence from 0 to 1, got {options.min_confidence}; choose again")
     from viewmend.cli.checks import chosen_times, load_named, log_preparation, with_two_cameras
     from viewmend.cli.console import say, track
+    from viewmend.data.camera_path import STATIC_FPS
     from viewmend.data.prepare import first_with_subject, open_masked, prepare
     from viewmend.data.source import prefetch
     from viewmend.export.scene import RESULTS, check_openexr, export_scene
@@ -87,9 +91,10 @@ def run(options: Options) -> int:
         shown = first_with_subject(capture, first=times[0], least=2) or capture.read(times[0])
         first = stream.add_frame(shown.to(options.device))
         views = _views(options, first, capture, opened.cameras[0].max_size_px)
+        fps = options.fps or capture.fps or STATIC_FPS
         usable = with_two_cameras(prefetch(capture, times), capture, len(times))
         frames = (frame.to(options.device) for frame in usable)
-        more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}
+        more = {"up": capture.up, "fps": fps, "min_confidence": options.min_confidence}
         frames = track(frames, "exporting", len(times))
         written = export_scene(frames, stream, views, capture.cameras, folder.draft, **more)
         folder.publish(*RESULTS)

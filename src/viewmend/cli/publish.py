@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from viewmend.cli.checks import Geometry, Precision, PreparationOptions, ViewOptions, check_least, make_studio
+from viewmend.cli.checks import (
+    Geometry,
+    Precision,
+    PreparationOptions,
+    ViewOptions,
+    check_fps,
+    check_least,
+    make_studio,
+)
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
@@ -102,11 +110,13 @@ def run(options: Options) -> int:
         first = stream.add_frame(shown.to(options.device))
         usable = with_two_cameras(prefetch(capture, times), capture, len(times))
         frames = (frame.to(options.device) for frame in usable)
+        used = [name for name in capture.cameras.names if name not in capture.left_out]
         made = publish(
             track(frames, "publishing", len(times)),
             len(times),
             stream,
             first,
+            capture.cameras.select(used),
             capture.up,
             folder.draft,
             config,
@@ -127,8 +137,7 @@ def _check(options: Options) -> None:
     check_least(options, completed_cameras=0, max_image_size=1, size=1)
     if not options.max_mb > 0:
         raise ValueError(f"expected --max-mb above 0, got {options.max_mb}; choose a size in megabytes")
-    if options.fps is not None and not 0 < options.fps <= 240:
-        raise ValueError(f"expected --fps above 0 and at most 240, got {options.fps}; choose again")
+    check_fps(options.fps)
 
 
 def _open(options: Options) -> "PreparedCapture":

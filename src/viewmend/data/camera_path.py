@@ -20,7 +20,7 @@ Pixels = Annotated[int, Meta(ge=2, le=16384)]
 STATIC_VIEWS = 60
 """A turntable has at least this many views by default."""
 STATIC_FPS = 15.0
-"""A turntable of a capture without a frame rate has this many views per second."""
+"""Turntables and scenes of a capture without a frame rate have this many frames per second."""
 
 
 class PathFile(Struct, frozen=True):

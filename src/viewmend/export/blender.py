@@ -21,7 +21,9 @@ HERE = Path(__file__).resolve().parent
 scene = json.loads(SCENE)
 z_up = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # from +y up
 
-bpy.context.scene.render.fps = max(1, round(scene["fps"]))
+render = bpy.context.scene.render
+render.fps = max(1, round(scene["fps"]))
+render.fps_base = render.fps / scene["fps"]
 bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, scene["frames"] - 1
 collections = {}
 for given in scene["cameras"]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.data.camera_path import STATIC_FPS
 from viewmend.data.images import write_image
 from viewmend.export.blender import blender_script
 from viewmend.export.engine_cameras import engine_from_world
@@ -52,12 +53,12 @@ def export_scene(
     out: Path,
     *,
     up: Float[Tensor, "3"] | None = None,
-    fps: float | None = None,
+    fps: float = STATIC_FPS,
     min_confidence: float = 0.5,
 ) -> SceneCounts:
     """Write each frame's hull, and novel views of it, into the folder `out`.
 
-    Files are numbered by position in `frames`. The world is the capture's, rotated so that +y is up.
+    Files are numbered by position in `frames`, without gaps. The world is the capture's, rotated so that +y is up.
 
     Args:
         frames: the capture, frame by frame.
@@ -90,8 +91,8 @@ def export_scene(
         points += len(cloud)
     groups = {"rig": rig.to("cpu"), "views": views.to("cpu")}
     images = {name: f"rgba/{name}/000000.png" for name in views.names}
-    write_text(out / "cameras.usda", usd_scene(groups, rotation, fps or 1.0, count))
-    write_text(out / "open_in_blender.py", blender_script(groups, rotation, fps or 1.0, count, images))
+    write_text(out / "cameras.usda", usd_scene(groups, rotation, fps, count))
+    write_text(out / "open_in_blender.py", blender_script(groups, rotation, fps, count, images))
     return SceneCounts(count, len(views), vertices, points)
 
 

@@ -60,8 +60,14 @@ def _usd_camera(prim: str, camera: Cameras, pose: list[list[float]]) -> list[str
 def _prim_names(names: tuple[str, ...]) -> list[str]:
     """Unique identifiers that USD allows."""
     found: list[str] = []
-    for n, name in enumerate(names):
+    for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-        plain = plain if plain and not plain[0].isdigit() else f"camera_{plain}"
-        found.append(f"{plain}_{n}" if plain in found else plain)
+        if not plain or plain[0].isdigit():
+            plain = f"camera_{plain}"
+        unique = plain
+        number = 1
+        while unique in found:
+            number += 1
+            unique = f"{plain}_{number}"
+        found.append(unique)
     return found

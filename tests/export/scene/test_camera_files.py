@@ -46,7 +46,7 @@ def test_usd_cameras_project_as_ours():
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (25, 6)
     scope = stage.GetPrimAtPath("/scene/rig")
-    assert [p.GetName() for p in scope.GetChildren()] == ["camera_1_a", "camera_1_a_1", "b_hne"]
+    assert [p.GetName() for p in scope.GetChildren()] == ["camera_1_a", "camera_1_a_2", "b_hne"]
     assert [p.GetDisplayName() for p in scope.GetChildren()] == list(RIG.names)
     uv, _ = project(POINTS, RIG)
     for view, prim in enumerate(scope.GetChildren()):
@@ -55,6 +55,14 @@ def test_usd_cameras_project_as_ours():
         for point, own in zip(POINTS @ ROTATION.mT, uv[view], strict=True):
             x, y, _ = matrix.Transform(Gf.Vec3d(*point.tolist()))
             assert [32 * (1 + x), 24 * (1 - y)] == pytest.approx(own.tolist(), abs=1e-2)
+
+
+def test_usd_names_are_unique_whatever_the_cameras_are_called():
+    rig = replace(RIG, names=("a b", "a_b_2", "a-b"))
+    stage = Usd.Stage.CreateInMemory()
+    assert stage.GetRootLayer().ImportFromString(usd_scene({"rig": rig}, ROTATION, 25.0, 1))
+    names = [prim.GetDisplayName() for prim in stage.GetPrimAtPath("/scene/rig").GetChildren()]
+    assert names == list(rig.names)
 
 
 class Matrix(np.ndarray):
@@ -91,8 +99,10 @@ def test_blender_cameras_project_as_ours(tmp_path, monkeypatch):
         (tmp_path / "hull" / f"{n:06d}.glb").touch()
     square = replace(RIG, K=RIG.K.clone())
     square.K[:, 1, 1] = square.K[:, 0, 0]
-    script = blender_script({"rig": square}, ROTATION, 25.0, 2, {"bühne": "rgba/bühne/000000.png"})
+    script = blender_script({"rig": square}, ROTATION, 29.97, 2, {"bühne": "rgba/bühne/000000.png"})
     made, shown, bpy = opened(script, tmp_path, monkeypatch)
+    render = bpy.context.scene.render
+    assert render.fps == 30 and render.fps / render.fps_base == pytest.approx(29.97)
     uv, _ = project(POINTS, square)
     for view, name in enumerate(square.names):
         camera = made[name]

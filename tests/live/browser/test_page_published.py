@@ -144,6 +144,8 @@ def test_completed_views_are_used_for_completed_and_not_for_rendered(browser, ho
             first = [url for url in page.asked if "/frames/0/" in url and "shape" not in url][:3]
             completed = [int(re.findall(r"/(\d+)\.bin", url)[0]) >= 6 for url in first]
             assert any(completed) == uses
+            versions = {re.findall(r"\?v=(\w+)$", url)[0] for url in page.asked if "/frames/" in url}
+            assert len(versions) == 1, "so that no file of an earlier performance comes from a cache"
 
 
 def test_it_works_in_an_iframe(browser, host):

@@ -14,15 +14,20 @@ const MODES = ["rendered", "holes", "completed", "split"];
 /** Find the URL of a file of the performance. @param {string} name */
 const locateFile = (name) => new URL(`../${name}`, import.meta.url);
 
-/** Find the URL of a shape or of an image. @param {string} path "TIME" or "TIME/CAMERA" */
-function locateAsset(path) {
+/**
+ * Find the URL of a shape or of an image. Hosts ignore the version, but browsers then do not take files from
+ * their cache that belong to an earlier performance at the same place.
+ * @param {string} path "TIME" or "TIME/CAMERA"
+ * @param {string} version of the performance
+ */
+function locateAsset(path, version) {
   const [time, camera] = path.split("/");
-  return locateFile(`frames/${time}/${camera ?? "shape"}.bin`).href;
+  return locateFile(`frames/${time}/${camera ?? "shape"}.bin?v=${version}`).href;
 }
 
 /** @returns {import("./page.js").Source} */
 function createPublishedSource() {
-  const recording = new Recording(() => fetch(locateFile("scene.json")));
+  const recording = new Recording(() => fetch(locateFile("scene.json"), { cache: "no-cache" }));
   const assets = new Assets(locateAsset, true);
   assets.addEventListener("change", () => {
     if (recording.scene && !assets.usable) {

@@ -50,7 +50,7 @@ function copyBytes(source) {
 
 export class CanvasFilm {
   /**
-   * @param {(path: string) => string} locate finds the URL of an asset
+   * @param {(path: string, version: string) => string} locate finds the URL of an asset
    * @param {() => any} getScene returns the content of scene.json
    * @param {(progress: {part: number, text: string}) => void} onProgress
    */
