@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from reference.ball import photograph, ring
+from reference.ball import BallCapture, photograph, ring
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.preprocess.masks.maker import ChromaMasks, MaskMaker, lasting, without_spill
-from viewmend.preprocess.masks.masked import agreed
+from viewmend.preprocess.masks.masked import MaskedCapture, agreed
 from viewmend.preprocess.masks.plate import PlateMasks, median_plate
 
 HEIGHT, WIDTH = 120, 160
@@ -144,3 +144,35 @@ def test_one_empty_mask_among_eight_spoils_no_other():
     others = [view for view in range(8) if view != 5]
     agreement = ((cleaned > 127) & (truth > 127))[others].sum() / (truth > 127)[others].sum()
     assert float(agreement) > 0.99
+
+
+def test_masks_whose_rays_diverge_support_nothing():
+    """Side by side, without bounds: such as shadows at the outer edges of two images."""
+    _, ball = rig_masks()
+    side_by_side = torch.eye(4).repeat(3, 1, 1)
+    side_by_side[:, 0, 3] = torch.tensor([0.0, -0.2, -0.4])
+    cameras = Cameras(ball.names[:3], ball.K[:3], side_by_side, ball.size_px[:3])
+    masks = torch.zeros(3, 120, 120, dtype=torch.uint8)
+    masks[0, 50:70, :8] = 255
+    masks[1, 50:70, 112:] = 255
+    masks[2, 50:70, 50:70] = 255
+    assert torch.equal(agreed(masks, cameras, None)[2], masks[2]), "as without the others"
+
+
+class _Speck(MaskMaker):
+    """Noise of a plate: a few pixels of an empty scene."""
+
+    def __init__(self, is_noisy: bool) -> None:
+        self.is_noisy = is_noisy
+
+    def mask(self, rgb):
+        mask = np.zeros(rgb.shape[:2], np.uint8)
+        mask[30:40, 30:40] = 255 * self.is_noisy
+        return mask
+
+
+def test_what_one_camera_alone_sees_does_not_take_the_empty_masks_of_the_others():
+    capture = BallCapture(ring(4, 120), 1)
+    makers = {name: _Speck(name == capture.cameras.names[0]) for name in capture.cameras.names}
+    frame = MaskedCapture(capture, makers, "pixels").read(0)
+    assert frame.cameras.names == capture.cameras.names

@@ -164,6 +164,21 @@ def test_an_empty_mask_is_right_where_the_subject_is_out_of_view(studio):
     assert not settled.without and not settled.remade and not settled.mask[3].any()
 
 
+def test_a_person_whom_one_camera_finds_is_not_denied_by_the_others(studio):
+    frame = studio.read(0)
+    masks = frame.mask.clone()
+    masks[1:] = 0
+    images = [view_rgb(frame, view) for view in range(4)]
+    settled = settle_masks(masks, images, frame.cameras, None, mask_near)
+    assert set(settled.without) == set(frame.cameras.names[1:]) and torch.equal(settled.mask, masks)
+    nobody = settle_masks(torch.zeros_like(masks), images, frame.cameras, None, mask_near)
+    assert not nobody.without, "an empty stage"
+
+
+def test_an_image_of_one_pixel_in_width_has_nobody():
+    assert not PersonMasks().mask(np.zeros((64, 1, 3), np.uint8)).any()
+
+
 @dataclass(frozen=True)
 class _Unmasked(CaptureWrapper):
     """The studio without masks, one of whose cameras shows an empty stage."""

@@ -36,7 +36,7 @@ LARGE_PART = 0.3
 """Parts of a mask count as large from this share of the largest part on."""
 NOT_FOUND = "nothing found where the other cameras see the subject"
 """Why a camera has no mask: it was looked for where the hull of the others is."""
-NO_HULL = "nothing found, and the masks of the other cameras do not agree on where the subject is"
+NO_HULL = "nothing found, and the masks of the other cameras do not show where the subject is"
 """Why a camera has no mask: there is no hull to look for it in."""
 
 
@@ -98,13 +98,14 @@ def settle_masks(
     """
     small, small_cameras = reduced(mask, cameras)
     present = [view for view in range(len(cameras)) if bool((small[view] > FOREGROUND).any())]
-    if len(present) < 2:
+    if not present:
         return Settled(mask)
+    unplaced = {name: NO_HULL for view, name in enumerate(cameras.names) if view not in present}
+    if len(present) == 1:
+        return Settled(mask, unplaced)
     trusted, silhouettes = _agreeing(small, small_cameras, bounds, present)
     if silhouettes is None or len(trusted) < AgreementThresholds().cameras * len(cameras):
-        return Settled(
-            mask, {name: NO_HULL for view, name in enumerate(cameras.names) if view not in present}
-        )
+        return Settled(mask, unplaced)
     settled = mask.clone()
     kept_at = {}
     parts = []

@@ -60,16 +60,26 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
     for view, size_px in enumerate(cameras.size_px.tolist()):
         others = [other for other in there if other != view]
         groups = max(1, len(others) // GROUP)
-        seen = []
-        for group in (others[first::groups] for first in range(groups if len(others) > 1 else 0)):
-            hull = reconstruct(small[group], small_cameras[group], bounds)
-            seen.append(hull.depth(small_cameras[view])[0].numpy() > 0)
+        target = small_cameras[view]
+        seen = [
+            _silhouette(small[group], small_cameras[group], bounds, target)
+            for group in (others[first::groups] for first in range(groups if len(others) > 1 else 0))
+        ]
         if any(one.any() for one in seen):
             votes = (widened(np.any(seen, 0)), np.all(seen, 0))
             some, all_ = (np.asarray(cv2.resize(vote.astype(np.float32), size_px)) > 0.5 for vote in votes)
             yield some, all_
         else:
             yield None
+
+
+def _silhouette(mask: Masks, cameras: Cameras, bounds: Bounds | None, target: Cameras) -> Inside:
+    """The silhouette, in one more camera, of the hull of these masks; empty without a hull."""
+    try:
+        return reconstruct(mask, cameras, bounds).depth(target)[0].numpy() > 0
+    except ValueError:  # the rays through the middles of the masks do not meet
+        width, height = target.max_size_px
+        return np.zeros((height, width), bool)
 
 
 def _judged(own: Mask, some: Inside, all_: Inside) -> Mask:
@@ -157,7 +167,8 @@ class MaskedCapture(CaptureWrapper):
         settled = settle_masks(mask, images, frame.cameras, self.bounds, self.mask_near)
         if self.clean_up == "pixels":  # pixels were compared already, so only empty masks are left out
             empty = [name for name in settled.without if not _own_mask(frame, name).any()]
-            settled = Settled(mask, {name: settled.without[name] for name in empty})
+            is_alone = len(empty) >= len(frame.cameras) - 1  # what one camera alone sees may be noise
+            settled = Settled(mask, {} if is_alone else {name: settled.without[name] for name in empty})
         self.notes.add(frame.time, settled)
         if settled.without:
             absent = [name for name in frame.cameras.names if name in settled.without]

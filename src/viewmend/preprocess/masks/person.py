@@ -173,7 +173,7 @@ def _detect(rgb: Rgb, small_people: bool = False) -> list[Roi]:
     found = _detect_in(rgb, 0, 0, max(height, width))
     if found or not small_people:
         return found
-    for side in (min(height, width), min(height, width) // 2):
+    for side in (min(height, width), max(1, min(height, width) // 2)):
         corners = itertools.product(_steps(height, side), _steps(width, side))
         tiles = [roi for top, left in corners for roi in _detect_in(rgb, left, top, side)]
         kept: list[Roi] = []
