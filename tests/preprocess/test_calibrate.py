@@ -1,6 +1,7 @@
 """Cameras from pictures of a board, and from silhouettes, both rendered by cameras that are known."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -12,14 +13,16 @@ from reference.capture_folder import edit_description
 from reference.computed_once import carve_coarsely
 from reference.filmed_board import photograph, waved
 
+from viewmend.cli import calibrate as calibrate_command
 from viewmend.cli import main
 from viewmend.data.capture_folder import open_capture, pinhole_cameras
+from viewmend.data.errors import CaptureError
 from viewmend.data.native_format import read_calibration
 from viewmend.data.native_writer import write_capture
 from viewmend.data.source import CaptureSubset
 from viewmend.geometry.cameras import project
 from viewmend.preprocess.calibration import cross_validation
-from viewmend.preprocess.calibration.board import Corners, parse_board
+from viewmend.preprocess.calibration.board import Corners, open_footage, parse_board
 from viewmend.preprocess.calibration.bundle import calibrate
 from viewmend.preprocess.calibration.cross_validation import HeldOutIou, best_hold, held_out_residual_px
 from viewmend.preprocess.calibration.silhouettes import HOLDS, Refinement, align_rig
@@ -229,6 +232,29 @@ def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, caps
     arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]
     assert main(arguments) == 2
     assert "keep the calibration" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_frames_that_are_not_used_are_counted(studio, tmp_path, capsys):
+    folder = shutil.copytree(studio[0], tmp_path / "take")
+    sorted((folder / "mask" / studio[1].names[0]).iterdir())[1].unlink()
+    frames, _ = calibrate_command._frames(calibrate_command.Options(source=folder, out=tmp_path / "out"))
+    assert [len(frame.cameras) for frame in frames] == [8]
+    assert "1 of 2 frames are used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "names, said",
+    [
+        (("left.mp4", "left.mov"), "one video for each camera, got 'left.mov' and 'left.mp4'"),
+        (("left.mp4", "right/0.png"), "got both ('left.mp4' and 'right')"),
+    ],
+)
+def test_footage_that_may_be_confused_is_refused(tmp_path, names, said):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(CaptureError, match=re.escape(said)):
+        open_footage(tmp_path)
 
 
 def test_three_cameras_are_too_few_for_silhouettes(studio, tmp_path, capsys):

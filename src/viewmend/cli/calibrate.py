@@ -149,6 +149,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
 def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     """Frames with a subject, all with the same cameras, as many as possible; and the capture's bounds."""
     from viewmend.cli.checks import chosen_times
+    from viewmend.cli.console import say
     from viewmend.data.prepare import open_masked, prepare
     from viewmend.preprocess.calibration.silhouettes import MIN_CAMERAS
 
@@ -165,5 +166,9 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     if len(most) < MIN_CAMERAS + 1:
         raise ValueError(
             f"expected {MIN_CAMERAS + 1} cameras or more with masks, got {len(most)}; use more, or --board"
+        )
+    if len(frames) < count:
+        say(
+            f"{len(frames)} of {count} frames are used: the others show no subject or lack one of {len(most)} cameras"
         )
     return frames, capture.bounds

@@ -208,13 +208,25 @@ def parse_board(text: str, dictionary: str) -> Board:
 def open_footage(folder: Path) -> NativeCalibration:
     """Open the videos or image folders of a folder as cameras, with placeholders for K and poses.
 
-    CaptureError if there are fewer than two.
+    CaptureError if there are fewer than two, both kinds, or two videos of one name.
     """
     entries = sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
-    videos = {entry.stem: entry.name for entry in entries if entry.is_file() and is_video(entry.name)}
-    chosen = videos or {
-        entry.name: entry.name for entry in entries if entry.is_dir() and list_images(folder, entry.name)
-    }
+    videos = [entry for entry in entries if entry.is_file() and is_video(entry.name)]
+    images = [entry for entry in entries if entry.is_dir() and list_images(folder, entry.name)]
+    if videos and images:
+        raise CaptureError(
+            f"{folder}: expected videos or folders of images, got both ('{videos[0].name}' and '{images[0].name}'); "
+            "put only the footage of the board there"
+        )
+    chosen: dict[str, str] = {}
+    for entry in videos or images:
+        name = entry.stem if videos else entry.name
+        if name in chosen:
+            raise CaptureError(
+                f"{folder}: expected one video for each camera, got '{chosen[name]}' and '{entry.name}'; "
+                "move one of them away"
+            )
+        chosen[name] = entry.name
     if len(chosen) < 2:
         expected = "two or more videos, or folders of images"
         got = len(chosen)
