@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -55,6 +56,21 @@ def test_a_signal_waits_until_what_is_unfinished_is_gone(tmp_path, monkeypatch):
             monkeypatch.setattr(shutil, "rmtree", disturbed)
         monkeypatch.undo()
         assert ended.value.code == 143 and not list(tmp_path.rglob("draft")) and not list(tmp_path.glob(".*"))
+
+
+def test_a_signal_waits_until_the_results_are_in_place(tmp_path, monkeypatch):
+    published(tmp_path / "out", ("0", "1", "2"))
+    rename = Path.rename
+
+    def disturbed(path, target):
+        signal.raise_signal(signal.SIGINT)
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", disturbed)
+    with pytest.raises(KeyboardInterrupt):
+        published(tmp_path / "out")
+    assert seen(tmp_path / "out") == ["pictures/0.png", "pictures/1.png", "sheet.png"]
+    assert (tmp_path / "out/sheet.png").read_text() == "sheet of 2"
 
 
 @pytest.mark.parametrize(

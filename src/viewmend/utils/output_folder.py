@@ -128,15 +128,17 @@ class OutputFolder:
         new = {file.relative_to(self.draft).as_posix(): [_digest(file)] for file in _below(self.draft, names)}
         # If killed in between, the folder holds files of both runs, all of them in the manifest.
         self._write({name: known.get(name, []) + new.get(name, []) for name in known | new})
-        for name in names:
-            with contextlib.suppress(FileNotFoundError):
-                (self.path / name).rename(self.draft / f"old-{name}")
-            with contextlib.suppress(FileNotFoundError):
-                (self.draft / name).rename(self.path / name)
-        gone = {
-            name for name in known if any(name == n or name.startswith(f"{n}/") for n in names)
-        } - new.keys()
-        self._write({name: value for name, value in (known | new).items() if name not in gone})
+        # Interrupted in between, the earlier results would be removed with the draft.
+        with defer_signals():
+            for name in names:
+                with contextlib.suppress(FileNotFoundError):
+                    (self.path / name).rename(self.draft / f"old-{name}")
+                with contextlib.suppress(FileNotFoundError):
+                    (self.draft / name).rename(self.path / name)
+            gone = {
+                name for name in known if any(name == n or name.startswith(f"{n}/") for n in names)
+            } - new.keys()
+            self._write({name: value for name, value in (known | new).items() if name not in gone})
 
     def _files(self, patterns: Iterable[str]) -> Iterator[Path]:
         for pattern in patterns:
