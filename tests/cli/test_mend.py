@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import av
 import cv2
@@ -13,7 +14,7 @@ from live.live_servers import wait_until
 from reference import tells_all
 from reference.ball import AwayBall, camera_at
 
-from viewmend.cli import main, serve
+from viewmend.cli import main, mend, serve
 from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.native_writer import write_capture
@@ -310,3 +311,10 @@ def test_images_are_used_at_a_fraction_of_their_size(folder, tmp_path, mend, cap
     assert cv2.imread(str(tmp_path / "half/completed/000000.png")).shape == (24, 24, 3)
     assert main(["mend", str(folder), "--out", str(tmp_path / "none"), *options, "--scale", "1.5"]) == 2
     assert "expected --scale above 0 and up to 1, got 1.5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("width, advised", [(1000, None), (1024, "0.9"), (1920, "0.5"), (20000, "0.1")])
+def test_the_advised_scale_makes_images_smaller(width, advised):
+    options = mend.Options(capture=Path("capture"), out=Path("out"))
+    advice = mend._speed_advice(options, camera_at(0, "wide").resized(width, 600))
+    assert (advised is None and advice == "") or f"--scale {advised} is faster" in advice

@@ -247,7 +247,8 @@ def _speed_advice(options: Options, cameras: "Cameras") -> str:
     size_px = max(cameras.max_size_px)
     if options.scale < 1 or size_px <= LARGE_PX:
         return ""
-    return f"images have {size_px} pixels along their longer side, and --scale {LARGE_PX / size_px:.1g} is faster"
+    tenths = max(1, 10 * LARGE_PX // size_px)
+    return f"images have {size_px} pixels along their longer side, and --scale {tenths / 10} is faster"
 
 
 def _open(options: Options, held: tuple[str, ...]) -> "CaptureFolder":

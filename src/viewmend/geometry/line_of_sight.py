@@ -159,8 +159,6 @@ def _find_outline(
 
     Returns about `count` points, evenly spaced along the outline. Distances are negative inside;
     the result is None without an outline.
-
-    Negative inside; None without an outline.
     """
     import cv2
 

@@ -95,7 +95,7 @@ ALPHA_SLOPE = 4.0
 MIN_DETAIL_WEIGHT = 0.01
 """Detail is the difference from a local mean, in which every pixel has at least this weight."""
 MARGIN_PX = 16
-"""A crop with a margin of this many pixels around the subject gives the same prediction as the whole view."""
+"""A crop with a margin of this many pixels around the subject gives nearly the same prediction as the whole view."""
 
 
 class ViewImage(NamedTuple):
