@@ -23,10 +23,13 @@ from viewmend.scenes.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.stream import Stream
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training import scenes as scenes_module
+from viewmend.training.config import SceneConfig
 from viewmend.training.held_back import HeldBack
 from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.samples import HeldOutCamera, Sample, rig_samples
 from viewmend.training.scenes import (
+    HARD_CALIBRATION,
+    HARD_MASKS,
     CaptureRigs,
     MixedRigs,
     SampleScenes,
@@ -150,6 +153,20 @@ def test_no_studio_uses_a_seed_reserved_for_validation_or_tests():
     assert seeds < {*range(9000)} and len(seeds) > 50
     assert validation < {*range(9000, 10000)}
     assert all(seeds.start >= 10000 and seeds.step > 0 for seeds in (P_SEEDS, Q_SEEDS))
+
+
+def test_hard_scenes_have_larger_errors_of_calibration_and_masks():
+    usual = SceneConfig(imperfect_fraction=1.0)
+    factors = {
+        "calibration_px": HARD_CALIBRATION,
+        "calibration_m": HARD_CALIBRATION,
+        "mask_edge_px": HARD_MASKS,
+    }
+    for seed in range(10):
+        errors = random_studio(usual, 2, Random(seed)).imperfections
+        hard_errors = random_studio(replace(usual, hard_fraction=1.0), 2, Random(seed)).imperfections
+        for name, largest in factors.items():
+            assert 1 <= getattr(hard_errors, name) / getattr(errors, name) <= largest
 
 
 def test_training_refuses_test_data(tmp_path):
