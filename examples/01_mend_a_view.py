@@ -20,21 +20,23 @@ from viewmend import (
 
 def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:
     """Complete the first camera's view from the others; write rendered, completed and true images side by side."""
-    # %% A capture is a folder with a cameras.json. If there is none, the studio makes a synthetic one.
-    if not (folder / "cameras.json").exists():
+    # %% A capture is a folder in any supported format. If there is none, the studio makes a synthetic one.
+    if not folder.exists():
         write_capture(Studio(StudioConfig(seed=10001, cameras=8, frames=frames, size_px=size_px)), folder)
     capture = open_capture(folder)
     print(f"{capture.name}: cameras {', '.join(capture.cameras.names)}, {len(capture.frame_ids)} frames")
 
     # %% Leave a camera out: its view is to be completed, and its image is the truth to compare with.
-    held, *inputs = capture.cameras.names
+    times = range(min(frames, len(capture.frame_ids)))
+    held = capture.read(times[-1]).cameras.names[0]
+    inputs = [name for name in capture.cameras.names if name != held]
     capture = prepare(capture, inputs)  # aligned, resized, colours matched
 
     # %% A stream takes camera frames one by one and completes views from any camera.
     stream = Stream(load_inpainter("views"), bounds=capture.bounds)
     target = capture.cameras.select([held])
     viewer, seen = None, None
-    for time in range(frames):
+    for time in times:
         stream.add_frame(capture.read(time).without([held]))
         seen = stream.view(target, viewer)
         viewer = seen.viewer  # the state for this viewer's next view
@@ -44,7 +46,7 @@ def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:
     view, completed = seen.completed.view, seen.completed.rgb
     print(f"coloured by {', '.join(view.source_views)}; {int(view.holes.sum())} pixels were missing")
     print(", ".join(f"{stage} {ms:.0f} ms" for stage, ms in vars(seen.times).items()))
-    frame = capture.read(frames - 1).select([held])
+    frame = capture.read(times[-1]).select([held])
     assert frame.mask is not None
     truth = frame.rgb[0] / 255 * (frame.mask[0] / 255)
 

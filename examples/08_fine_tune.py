@@ -1,7 +1,7 @@
 """Fine-tune the default model on a capture and compare: `python examples/08_fine_tune.py CAPTURE [OUT]`.
 
 `viewmend train finetune` holds back one camera and the last frames, by which it chooses the best weights. This program
-scores both models on the last frame of that camera, which training has not seen.
+scores both models on the last image of that camera, which training has not seen.
 """
 
 import math
@@ -16,7 +16,8 @@ def psnr_db(inpainter: Inpainter, capture: Path, held: str) -> float:
     """PSNR of a camera's last image, on black, completed from the other cameras."""
     opened = open_capture(capture)
     prepared = prepare(opened, [name for name in opened.cameras.names if name != held])
-    frame = prepared.read(len(prepared.frame_ids) - 1)
+    backwards = (prepared.read(time) for time in reversed(range(len(prepared.frame_ids))))
+    frame = next(frame for frame in backwards if held in frame.cameras.names)
     stream = Stream(inpainter, bounds=prepared.bounds)
     stream.add_frame(frame.without([held]))
     completed = stream.view(prepared.cameras.select([held])).completed.rgb

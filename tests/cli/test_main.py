@@ -10,6 +10,7 @@ import pytest
 
 from viewmend import cli
 from viewmend.cli import console, main
+from viewmend.cli.checks import check_device
 from viewmend.cli.console import busy, printable, say, show, track
 
 
@@ -116,9 +117,9 @@ def test_an_error_is_one_line_whatever_it_names(capsys):
 def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
     monkeypatch.setattr(console, "INTERVAL_S", 0.05)
     for _ in track(range(2), "counting"):
-        sleep(0.12)
+        sleep(0.4)
     with busy("thinking"):
-        sleep(0.12)
+        sleep(0.4)
     said = capsys.readouterr().err.splitlines()
     assert {"counting: 0 of 2", "counting: 1 of 2, 0 s left", "thinking: 0 s so far"} <= set(said)
     assert [console._duration(s) for s in (80.0, 1200.0, 9000.0)] == ["80 s", "20 min", "2.5 h"]
@@ -215,3 +216,11 @@ def test_names_are_utf8_in_every_locale(tmp_path, locale):
     assert done.returncode == 0, done.stderr
     names, letter = done.stdout.decode("ascii").splitlines()
     assert names == ascii(["カメラ1", "カメラ1"]) and letter == "\\xfc"
+
+
+def test_a_gpu_that_does_not_exist_is_refused(monkeypatch):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    for name in ("cpu", "cuda", "cuda:1"):
+        check_device(name)
+    with pytest.raises(ValueError, match=r"available device \(cpu, cuda, cuda:0, cuda:1\), got 'cuda:2'"):
+        check_device("cuda:2")

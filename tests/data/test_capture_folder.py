@@ -281,6 +281,16 @@ def test_images_and_masks_may_be_videos(plain):
     )
 
 
+@pytest.mark.parametrize(("stated", "expected"), [(None, 25), (25.1, 25.1), (30, 25)])
+def test_the_rate_is_that_of_the_videos(plain, stated, expected):
+    for view, name in enumerate("abcd"):
+        plain.put_video(f"{name}.avi", [np.zeros((32, 40, 3), np.uint8)] * 4)
+        update(plain, view, video=f"{name}.avi", image=None, mask=None)
+    plain.description |= {"fps": stated, "frames": [f"{n:03d}" for n in range(4)]}
+    plain.save()
+    assert open_capture(plain.path).fps == pytest.approx(expected)
+
+
 def test_written_videos_keep_size_and_colour(tmp_path):
     rgb = np.zeros((33, 41, 3), np.uint8)
     rgb[:, :20] = (200, 30, 60)

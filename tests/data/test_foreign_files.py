@@ -87,6 +87,13 @@ def test_labels_are_mentioned_once_and_faint_masks_are_no_labels(plain, caplog):
     assert open_capture(plain.path).read(0).mask[0].max() == 1
 
 
+def test_noise_of_masks_without_a_subject_is_no_label(plain, rng):
+    for name in "abcd":
+        noise = torch.randint(0, 6, (32, 40), generator=rng) * (torch.rand(32, 40, generator=rng) < 0.2)
+        plain.put(f"masks/{name}_000.png", noise.byte().numpy())
+    assert not open_capture(plain.path).read(0).has_subject
+
+
 def test_labels_survive_jpeg(plain, caplog):
     expected = open_capture(plain.path).read(0).mask
     for view, name in enumerate("abcd"):

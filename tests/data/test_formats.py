@@ -149,7 +149,12 @@ def test_scenes_of_other_formats_have_fingerprints(tmp_path):
     assert [scene.held for scene in scenes] == [camera["name"] for camera in rig]
     before = scenes[0].fingerprint
     write_easymocap(tmp_path, [camera | {"t": camera["t"] + 1} for camera in rig])
-    assert capture_set(tmp_path)[0].fingerprint != before  # only the second file changed
+    moved = capture_set(tmp_path)[0].fingerprint
+    assert moved != before  # only the second file changed
+    extrinsics = tmp_path / "extri.yml"
+    numbers = "!!opencv-matrix\n   rows: 2\n   cols: 3\n   dt: d\n   data: [ -1., -1., -1., 1., 1., 1. ]\n"
+    extrinsics.write_text(f"{extrinsics.read_text()}bounds_{rig[0]['name']}: {numbers}")
+    assert capture_set(tmp_path)[0].fingerprint != moved
 
 
 def test_formats_are_recognised_or_selected(tmp_path):

@@ -24,6 +24,7 @@ from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.leave_one_out import find_cut_off_subject, find_outlier_by_hull
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import read_any_calibration
+from viewmend.data.formats.files import list_images
 from viewmend.data.image_orientation import (
     avif_orientation,
     exif_orientation,
@@ -71,6 +72,28 @@ def test_cameras_without_footage_are_left_out_and_named(tmp_path, caplog, format
         "no calibrated camera is not used: videos/witness.mp4" in caplog.text
         and "background" not in caplog.text
     )
+
+
+@pytest.mark.parametrize(
+    ("chosen", "times", "fps"), [((0, 1), 24, 60), ((2, 3), 12, 30), ((0, 1, 2, 3), 12, 30)]
+)
+def test_of_fast_and_slow_videos_all_frames_of_the_chosen_are_used(tmp_path, chosen, times, fps):
+    rig = rig_of(4)
+    write_calibration(tmp_path, rig, POSE2SIM)
+    for number, camera in enumerate(rig):
+        is_fast = number < 2
+        frames = [picture(n) for n in range(24 if is_fast else 12)]
+        write_film(tmp_path / f"videos/{camera['name']}.mp4", frames, fps=60 if is_fast else 30)
+    capture = open_capture(tmp_path, [rig[number]["name"] for number in chosen])
+    assert (len(capture.frame_ids), capture.fps) == (times, fps)
+    assert capture.read(times - 1).cameras.names == capture.cameras.names
+    assert not any("as listed" in issue.text for issue in capture.issues)
+
+
+def test_a_name_with_two_dots_keeps_its_suffix(tmp_path):
+    cv2.imwrite(str(tmp_path / "frame0001.v2.png"), np.zeros((4, 4, 3), np.uint8))
+    images = list_images(tmp_path, "")
+    assert [images.pattern.replace("{frame}", frame) for frame in images.frames] == ["frame0001.v2.png"]
 
 
 DATA_SETS = {

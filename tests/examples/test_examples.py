@@ -20,12 +20,14 @@ import viewmend
 from viewmend import cli
 from viewmend.data import formats
 from viewmend.data.capture_folder import open_capture
+from viewmend.data.native_writer import write_capture
 from viewmend.live.push import PushSource
 from viewmend.models.base import Inpainter
 from viewmend.models.checkpoint import save_inpainter
 from viewmend.models.registry import make_method
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.studio.stage import Studio, StudioConfig
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -65,6 +67,11 @@ def test_a_capture_becomes_a_picture(tmp_path, capsys):
     rendered, completed, truth = (image[:, i * 96 : (i + 1) * 96].astype(float) for i in range(3))
     assert image.shape == (96, 288, 3)
     assert ((completed - truth) ** 2).mean() < ((rendered - truth) ** 2).mean()
+
+
+def test_a_capture_of_one_frame_becomes_a_picture(tmp_path):
+    write_capture(Studio(StudioConfig(cameras=6, frames=1, size_px=96)), tmp_path / "take")
+    assert example(1)["main"](tmp_path / "take").is_file()
 
 
 def test_views_of_another_renderer_are_completed(tmp_path):

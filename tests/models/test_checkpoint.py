@@ -40,6 +40,16 @@ def change_config(folder, changes):
     (folder / "config.json").write_text(json.dumps(values | changes))
 
 
+def test_a_model_that_cannot_be_written_replaces_none(saved):
+    before = {path.name: path.read_bytes() for path in saved.iterdir()}
+    net = tiny()
+    with torch.no_grad():
+        next(net.parameters()).fill_(torch.nan)
+    with pytest.raises(FloatingPointError):
+        save_inpainter(net, saved, "# Another card")
+    assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+
+
 @pytest.mark.parametrize("make", [tiny, tiny_rays, lambda: ViewSynthNet(VIEWS)])
 def test_a_saved_model_loads(make, tmp_path):
     net = make()

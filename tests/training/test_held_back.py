@@ -26,6 +26,7 @@ from viewmend.training.held_back import (
     HeldBack,
     HeldBackValidation,
     KeptWeights,
+    _subject_box,
     compare,
     held_back_views,
 )
@@ -258,3 +259,12 @@ def test_psnr_and_lpips_are_both_weighed(place, tmp_path):
     found = HeldBackValidation([place], AUTO)(ViewSynthNet(VIEWS_MODEL), tmp_path / "shown.png")
     assert found["score"] == pytest.approx(found["psnr_whole"] - held_back.LPIPS_DB * found["lpips_subject"])
     assert (tmp_path / "shown.png").exists()
+
+
+def test_lpips_is_of_the_subject_with_a_margin_and_of_all_without_a_subject():
+    mask = torch.zeros(200, 300, dtype=torch.uint8)
+    assert _subject_box(mask) == (slice(0, 200), slice(0, 300))
+    mask[20:120, 150:160] = 255
+    mask[20:30, 100:110] = 255
+    rows, columns = _subject_box(mask)
+    assert rows == slice(12, 128) and (columns.start, columns.stop) == (92, 168)

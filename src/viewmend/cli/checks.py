@@ -93,8 +93,10 @@ def check_device(name: str) -> None:
     """Raise a ValueError unless this device exists."""
     import torch
 
-    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
-        raise ValueError(f"expected an available device, got '{name}'; use --device cpu")
+    count = torch.cuda.device_count()
+    available = ["cpu", *(["cuda"] if count else []), *(f"cuda:{number}" for number in range(count))]
+    if name not in available:
+        raise ValueError(f"expected an available device ({', '.join(available)}), got '{name}'; choose one")
 
 
 def check_people(performers: Path | None, motions: Path | None) -> None:

@@ -29,7 +29,7 @@ from viewmend.data.native_format import (
     stays_inside,
 )
 from viewmend.data.source import CaptureSource, CaptureWrapper
-from viewmend.data.video_clock import Track, VideoClock, match_tracks, video_track
+from viewmend.data.video_clock import RATE_TOLERANCE, Track, VideoClock, match_tracks, video_track
 from viewmend.data.videos import is_video, video_properties
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -125,12 +125,17 @@ class CaptureFolder:
         self.cameras = pinhole_cameras(self._native_cameras)
         self.clock = read_clock(replace(calibration, cameras=self._native_cameras))
         """When the frames were taken; None for a capture of images without offsets (see `read_clock`)."""
+        self.fps = calibration.fps
+        if self.clock is not None:
+            self.fps = _choose_fps(calibration.fps, self.clock)
+            calibration = replace(
+                calibration, frames=_ids_in_use(calibration, self._native_cameras, self.clock)
+            )
         self._listed = calibration.frames
 
         # With a clock, the frame id at index i stands for the clock's time i; surplus ids are not used
         num_frames = len(self._listed) if self.clock is None else len(self.clock.times_s)
         self.frame_ids = calibration.frames[:num_frames]
-        self.fps = calibration.fps
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
         corners = calibration.bounds_m
         self.bounds = (
@@ -389,6 +394,36 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
         camera_from_world=rigid(R, t).float(),
         size_px=torch.tensor([[camera.width, camera.height] for camera in cameras]),
     )
+
+
+def _choose_fps(stated_fps: float | None, clock: VideoClock) -> float | None:
+    """The rate of the frames: as stated, unless it is not that of the clock's times."""
+    if stated_fps is None or clock.fps is None:
+        return stated_fps or clock.fps
+    return stated_fps if abs(clock.fps / stated_fps - 1) < RATE_TOLERANCE else clock.fps
+
+
+def _ids_in_use(
+    calibration: NativeCalibration, used: Sequence[NativeCamera], clock: VideoClock
+) -> tuple[str, ...]:
+    """The ids of the frames of the videos in use.
+
+    Formats without a list of frames count those of all videos. If some are left out, the others may have more
+    frames, or fewer.
+    """
+    listed = calibration.frames
+    is_counted = listed == tuple(f"{time:06d}" for time in range(len(listed)))
+    has_numbered_files = any(
+        "{frame}" in str(path) for camera in used for path in (camera.image, camera.mask)
+    )
+    if (
+        calibration.file.name == CALIBRATION
+        or len(used) == len(calibration.cameras)
+        or has_numbered_files
+        or not is_counted
+    ):
+        return listed
+    return tuple(f"{time:06d}" for time in range(clock.end))
 
 
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:

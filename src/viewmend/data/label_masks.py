@@ -20,6 +20,9 @@ class LabelMaskRule:
     """A mask is opaque if some pixel has at least this value of 255."""
     max_labels: int = MAX_LABELS
     """Masks without an opaque pixel hold labels if they have at most this many values in all."""
+    min_compact: float = 0.5
+    """Masks of which none is opaque hold labels if at least this share of the foreground has more of it to
+    the right and below; noise has not."""
     min_share: float = 0.005
     """A single mask holds a label only if at least this share of its pixels has it, and at least
     this share is 0."""
@@ -54,8 +57,8 @@ class LabelMasks:
     def convert(self, mask: Masks) -> ConvertedMasks | None:
         """The masks of a frame with labels as 255; None if they stay as they are.
 
-        As long as no mask was opaque, all masks hold labels if they have few values, and have a low
-        opaque level if nearly all of their foreground is at one level. Once a mask was opaque, each
+        As long as no mask was opaque, all masks hold labels if they have few values, in areas, and have a
+        low opaque level if nearly all of their foreground is at one level. Once a mask was opaque, each
         other mask is judged by itself: it holds a label if it consists of 0 and one low value.
         """
         highest = mask.flatten(1).amax(1).tolist()
@@ -71,8 +74,18 @@ class LabelMasks:
             return None
         count = len(torch.bincount(mask.flatten(), minlength=256).nonzero())
         if count <= self._rule.max_labels:
+            if _compact_share(mask) < self._rule.min_compact:
+                return None
             return _from_labels(mask, range(len(mask)), None, max(highest))
         return _from_low_level(mask, max(highest), self._rule)
+
+
+def _compact_share(mask: Masks) -> float:
+    """The share of the foreground whose right and lower neighbours are foreground as well."""
+    inside = mask > 0
+    inner = inside[:, :-1, :-1]
+    is_compact = inner & inside[:, :-1, 1:] & inside[:, 1:, :-1]
+    return int(is_compact.sum()) / max(int(inner.sum()), 1)
 
 
 def _views_with_one_label(mask: Masks, highest: Sequence[int], rule: LabelMaskRule) -> list[int]:

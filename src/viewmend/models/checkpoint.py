@@ -120,9 +120,9 @@ def save_inpainter(network: Model, folder: str | Path, card: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     kind = next(name for name, config in CONFIGS.items() if isinstance(network.config, config))
     config = {"viewmend_format": FORMAT, "network": kind} | network.config.to_dict()
+    write_tensors(folder / WEIGHTS, network.state_dict(), {"format": "pt"})  # first, as it may be refused
     write_text(folder / CONFIG, json.dumps(config, indent=2) + "\n")
     write_text(folder / CARD, card)
-    write_tensors(folder / WEIGHTS, network.state_dict(), {"format": "pt"})
 
 
 def model_folder(name_or_path: str | Path) -> Path:

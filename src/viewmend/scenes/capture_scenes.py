@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from msgspec import Meta, Struct, structs
 
@@ -143,9 +144,11 @@ def _fingerprint(folder: Path, format: str | None) -> str:
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     calibration = plain.file.read_bytes()
     if plain.file.name != CALIBRATION:  # there may be other files in the folder
-        calibration = repr(
-            [(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]
-        ).encode()
+        arrays = [plain.bounds_m, plain.origin_m]
+        arrays += [value for c in plain.cameras for value in (c.K, c.R, c.t_m, c.dist, c.colour)]
+        plain_values = [None if value is None else np.asarray(value).tolist() for value in arrays]
+        cameras = [(c.name, c.width, c.height, c.mask_labels, c.offset_ms) for c in plain.cameras]
+        calibration = repr((plain_values, cameras)).encode()
     return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()
 
 

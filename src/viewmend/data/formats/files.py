@@ -480,8 +480,8 @@ def list_images(folder: Path, place: str) -> ImageList | None:
     if numbered and len(alike) > 1:
         pattern, frames = frame_pattern(alike)
     elif numbered:
-        before, number, after = re.findall(r"(.*?)(\d+)(\D*\.\w+)", alike[0])[0]
-        pattern = f"{before}{{frame}}{after}"
+        before, number, after = re.findall(r"(.*?)(\d+)(\D*)$", Path(alike[0]).stem)[0]
+        pattern = f"{before}{{frame}}{after}{Path(alike[0]).suffix}"
         frames = (number,)
     else:
         pattern = f"{{frame}}{Path(alike[0]).suffix}"
