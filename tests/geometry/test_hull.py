@@ -147,6 +147,18 @@ def test_bounds_hold_what_cameras_look_at_and_cameras_that_look_apart_have_none(
         bounds_from_cameras(concatenate_cameras(apart))
 
 
+def test_masks_that_show_no_common_subject_have_an_empty_hull():
+    cameras = concatenate_cameras([camera_at((2.5, 0, -0.2)), camera_at((2.5, 0, 0.2))])
+    width, height = cameras.max_size_px
+    masks = torch.zeros(2, 2, height, width, dtype=torch.uint8)  # outer edges, then inner ones
+    for number, sides in enumerate(((slice(0, 3), slice(-3, None)), (slice(-3, None), slice(0, 3)))):
+        for view, columns in enumerate(sides):
+            masks[number, view, height // 2 - 2 : height // 2 + 2, columns] = 255
+    low = bounds_from_cameras(cameras).low
+    diverging = [own for own in masks if torch.equal(bounds_from_masks(own, cameras).low, low)]
+    assert len(diverging) == 1 and len(reconstruct(diverging[0], cameras).mesh.vertices) == 0
+
+
 @pytest.mark.parametrize("shape", [(7, 5, 6), (4, 8, 3), (1, 1, 1)])
 @pytest.mark.parametrize("value", [0.0, FAINT, 0.3, ISO, 0.6])
 def test_a_grid_is_summarised_as_on_a_device(shape, value, rng):

@@ -357,7 +357,8 @@ def bounds_from_cameras(cameras: Cameras) -> Bounds:
 def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bounds:
     """A cube that holds the masks' subject: centred where the rays through the masks' middles come closest.
 
-    If fewer than two masks have any foreground, that of `bounds_from_cameras`.
+    If fewer than two masks have any foreground, or these rays meet behind the cameras, because the
+    foreground is not one subject, that of `bounds_from_cameras`.
 
     Raises:
         ValueError: there is one camera only, or the cameras look away from each other.
@@ -377,7 +378,10 @@ def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras
     focal = torch.stack([seeing.K[:, 0, 0], seeing.K[:, 1, 1]], -1)
     # The subject may be nearer to a camera than its middle and is round: take half as much again.
     half = 1.5 * ((box[:, 2:] - box[:, :2]) / 2 / focal).amax(-1)
-    return _cube_around(seeing, directions, half, largest=True)
+    try:
+        return _cube_around(seeing, directions, half, largest=True)
+    except ValueError:
+        return bounds_from_cameras(rig)
 
 
 def _mask_boxes(mask: UInt8[Tensor, "view height width"]) -> list[tuple[int, int, int, int] | None]:
