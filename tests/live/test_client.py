@@ -5,7 +5,7 @@ from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
-from live.live_servers import FakeClock, running
+from live.live_servers import FakeClock, running, wait_until
 
 from viewmend.live import client as client_module
 from viewmend.live.client import Client, ConnectionLostError
@@ -67,6 +67,7 @@ def test_a_refusal_is_not_a_lost_connection(ball):
             ):
                 Client(server.ws, token, reconnect_s=60.0).__enter__()
             assert not isinstance(refused.value, ConnectionLostError)
+            wait_until(lambda: not server.live.registry.sessions)
 
 
 def test_it_gives_up_when_no_server_comes_back():

@@ -27,9 +27,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         view.page.keyboard.press("n")
         view.until(lambda: view.page.locator("#input-row").is_visible())
         view.page.keyboard.press("x")
-        view.until(
-            lambda: session.wanted_look is not None and session.wanted_look.without == (NAME,), SCREENSHOT_S
-        )
+        view.until(lambda: getattr(session.wanted_look, "without", None) == (NAME,), SCREENSHOT_S)
         view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
         assert texts(view, "left-name", "right-name") == ["Completed (views)", "Original"]
         asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={NAME}&without={NAME}"
@@ -37,9 +35,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         assert f"subject {score:.1f} dB" in view.page.locator("#error-name").inner_text()
         view.until(lambda: f"without={NAME}" in view.page.url)
         view.page.get_by_role("button", name="Use all cameras").click()
-        view.until(
-            lambda: session.wanted_look is not None and session.wanted_look.without == (), SCREENSHOT_S
-        )
+        view.until(lambda: getattr(session.wanted_look, "without", None) == (), SCREENSHOT_S)
         view.until(lambda: view.page.locator("#error-name").is_hidden())
 
 
@@ -79,12 +75,8 @@ def test_two_models_are_compared(browser, ball):
         view.page.locator("#split-left").select_option("completed")
         view.page.locator("#split-right").select_option("compared:paper-small")
         (session,) = ball.live.registry.sessions
-        view.until(
-            lambda: (
-                session.wanted_look is not None and session.wanted_look.modes == ("completed", "compared")
-            ),
-            SCREENSHOT_S,
-        )
+        modes = ("completed", "compared")
+        view.until(lambda: getattr(session.wanted_look, "modes", None) == modes, SCREENSHOT_S)
         assert session.wanted_look.model == "paper-small"
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         assert texts(view, "right-name") == ["Completed (paper-small)"] and ball.service.error is None

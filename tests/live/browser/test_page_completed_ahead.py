@@ -29,14 +29,16 @@ class Green(SmoothFill):
 
 @pytest.mark.parametrize("mode", ["completed", "rendered"])
 def test_a_moving_view_is_drawn_from_completed_views_unless_it_is_shown_as_rendered(browser, mode):
-    asked = set()
+    got = set()
     with (
         running(inpainter=Green(), completed_cameras=COUNT) as server,
         opened(browser, server, query=f"?time=0&mode={mode}") as view,
     ):
-        view.page.on("request", lambda request: asked.update(re.findall(r"assets/0/(\d+)", request.url)))
+        view.page.on(
+            "requestfinished", lambda request: got.update(re.findall(r"assets/0/(\d+)", request.url))
+        )
         completed = {str(len(CAMERAS) + n) for n in range(COUNT)}
-        view.until(lambda: completed <= asked, SCREENSHOT_S)
+        view.until(lambda: completed <= got, SCREENSHOT_S)
         view.page.wait_for_timeout(500)
         with silent(server):
             for _ in range(4):
@@ -60,10 +62,12 @@ def complete_for_ever(*order):
 
 def shown_area(browser, server, mode: str, last_asset: str) -> float:
     """The share of the canvas that a moving view covers, once the page has the fused mesh and this asset."""
-    asked = set()
+    got = set()
     with opened(browser, server, query=f"?time=0&mode={mode}") as view:
-        view.page.on("request", lambda request: asked.update(re.findall(r"assets/0/(\w+)", request.url)))
-        view.until(lambda: {"mesh", last_asset} <= asked, SCREENSHOT_S)
+        view.page.on(
+            "requestfinished", lambda request: got.update(re.findall(r"assets/0/(\w+)", request.url))
+        )
+        view.until(lambda: {"mesh", last_asset} <= got, SCREENSHOT_S)
         view.page.wait_for_timeout(500)
         with silent(server):
             view.drag(120, 0)

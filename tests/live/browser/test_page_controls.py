@@ -81,7 +81,7 @@ def test_side_by_side_has_a_divider_that_is_dragged(view):
     view.page.mouse.down()
     view.page.mouse.move(middle - 150, y, steps=3)
     view.page.mouse.up()
-    view.page.wait_for_timeout(100)
+    view.until(lambda: split.bounding_box()["x"] < box["x"] - 145)
     assert share(view.picture()[:, middle - 120 :], scene.PINK) == 0
     at = float(split.get_attribute("aria-valuenow"))
     split.focus()

@@ -138,11 +138,13 @@ def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, 
             picture, _, mask = rendered(ball, 0, "completed")
             assert psnr_in_box(shown, picture, mask, np.zeros_like(mask)) > 30, "as JPEG"
         (session,) = ball.live.registry.sessions
+        cancelled, cancel = [], session.cancel
+        session.cancel = lambda: cancelled.append(True) or cancel()
         x, y = view.middle()
         view.page.mouse.move(x, y)
         view.page.mouse.down()
         view.page.mouse.move(x + 40, y)
-        view.until(lambda: session.wanted_look is None)
+        view.until(lambda: cancelled)
         looks, take = [], session.look
         session.look = lambda look: take(looks.append(look) or look)
         for step in range(10):
@@ -238,7 +240,7 @@ def test_a_paused_frame_whose_assets_failed_is_fetched_again(browser, ball):
             route.continue_()
 
     with opened(browser, ball, query="?time=0", route=fail_once) as view:
-        view.until(lambda: view.data("drawn") == "0", 30)
+        view.until(lambda: view.data("drawn") == "0", SCREENSHOT_S)
 
 
 def test_after_an_outage_a_new_connection_lets_the_page_draw_again(browser, ball):
@@ -257,7 +259,7 @@ def test_after_an_outage_a_new_connection_lets_the_page_draw_again(browser, ball
         for connection in list(ball.live.registry.connections):
             error = ClosingError(CloseCode.TIMEOUT, "an outage")
             connection._loop.call_soon_threadsafe(connection.fail, error)
-        view.until(lambda: view.data("drawn") == "0", 30)
+        view.until(lambda: view.data("drawn") == "0", SCREENSHOT_S)
 
 
 @pytest.mark.parametrize("scene", ["wd2", "utrecht", "studio"])

@@ -1,5 +1,7 @@
 """What the page says and does when something is slow, missing or broken."""
 
+import re
+
 import numpy as np
 import pytest
 from live.browser import scene
@@ -29,6 +31,18 @@ LOSE_GPU = (
     " const e = gl.getExtension('WEBGL_lose_context'); e.loseContext();"
     " await new Promise(r => setTimeout(r, 200)); e.restoreContext(); })()"
 )
+TRY_AGAIN = (
+    "(() => { const button = document.querySelector('#cover-retry');"
+    " if (!button.checkVisibility()) return false;"
+    " button.click();"
+    " return document.querySelector('#cover-title').textContent === 'Connecting'; })()"
+)
+"""In one step, as there is no button while the page tries; true if it tries at once."""
+REQUEST_AND_WAIT = (
+    "setTimeout(() => { const request = new XMLHttpRequest();"
+    " request.open('GET', 'unanswered', false); request.send(); })"
+)
+"""Stops the page's thread until the request is answered."""
 
 # A reload may take milliseconds and no request: the browser has the image already.
 COUNT_ORIGINALS = (
@@ -70,12 +84,16 @@ def test_a_page_that_repaints_slowly_gets_no_more_pictures_than_it_takes(browser
     server.playing = True
     with opened(browser, server, query="?mode=depth") as view:
         view.until(lambda: server.viewers and server.viewers[-1].sent > 3)
-        viewer = server.viewers[-1]
+        viewer, unanswered = server.viewers[-1], []
+        view.page.route("**/unanswered", lambda route: unanswered.append(route))
+        view.page.evaluate(REQUEST_AND_WAIT)
+        view.until(lambda: unanswered)
         before = viewer.sent
-        view.page.evaluate("const start = performance.now(); while (performance.now() < start + 3000);")
+        view.page.wait_for_timeout(3000)
         assert viewer.sent <= before + 3, (
             "one that the page had not taken, one that waits, and one on its way"
         )
+        unanswered[0].fulfill()
         view.until(lambda: viewer.sent > before + 6)
 
 
@@ -97,10 +115,12 @@ def test_who_comes_back_while_a_try_is_due_has_one_connection(desktop):
 def test_while_it_is_lost_there_is_a_button(desktop):
     desktop.server.refuse = 4503
     desktop.server.drop()
-    desktop.until(lambda: "The maximum number of viewers is reached" in cover(desktop))
-    assert "Retrying in" in cover(desktop)
+    said = r"The maximum number of viewers is reached\.\s+Retrying in"
+    desktop.until(lambda: re.search(said, cover(desktop)))
+    desktop.page.locator("#cover-retry").click()  # there is one again after each try
+    desktop.until(TRY_AGAIN)
     desktop.server.refuse = None
-    desktop.until(lambda: not cover(desktop) or (desktop.page.locator("#cover-retry").click() or False), 20)
+    desktop.until(lambda: not cover(desktop))
 
 
 @pytest.mark.parametrize(("code", "words"), [(4401, "needs a token"), (4426, "Reload the page")])
@@ -138,7 +158,7 @@ def test_a_failing_source_and_model_are_said_beside_the_picture(desktop):
 def test_a_stall_is_said(desktop):
     desktop.server.hold = True
     desktop.drag(60, 0)
-    desktop.until(lambda: desktop.page.locator("#pill").is_visible(), 8)
+    desktop.until(desktop.page.locator("#pill").is_visible)
     assert "Waiting for the server" in desktop.page.locator("#pill").inner_text()
     desktop.server.hold = False
     desktop.until(desktop.page.locator("#pill").is_hidden)

@@ -82,8 +82,7 @@ def test_the_first_picture_appears_and_orbiting_changes_it(browser, host):
         assert page.page.locator("#poster").count() == 0 and page.page.locator("#cover").is_hidden()
         assert page.page.title() == "A <ball>"
         page.drag(160, 0)
-        page.page.wait_for_timeout(500)
-        assert np.abs(page.picture() - shown).mean() > 1
+        page.until(lambda: np.abs(page.picture() - shown).mean() > 1)
         page.until(lambda: "pose=" in page.page.url)
         assert all(url.startswith((f"{host}some/ball/", "blob:", "data:")) for url in page.asked), (
             "nothing else is asked for"
@@ -161,8 +160,7 @@ def test_it_works_in_an_iframe(browser, host):
         assert np.abs(page.pixels()[:600, :900] - shown).mean() < 0.1, "the page around it keeps the wheel"
         page.page.mouse.click(450, 300)
         page.page.mouse.wheel(0, 300)
-        page.page.wait_for_timeout(500)
-        assert np.abs(page.pixels()[:600, :900] - shown).mean() > 0.5
+        page.until(lambda: np.abs(page.pixels()[:600, :900] - shown).mean() > 0.5)
 
 
 def test_a_path_becomes_a_film_without_a_server(browser, host, tmp_path):

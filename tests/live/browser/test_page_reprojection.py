@@ -102,26 +102,21 @@ HEADSET = """
 
 
 def test_a_headset_gets_two_eyes_of_one_state(browser, server):
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    page = context.new_page()
-    page.add_init_script(HEADSET)
-    page.goto(server.url)
-    page.wait_for_selector("#picture[data-frame]")
-    page.get_by_role("button", name="Enter VR").click()
-    page.wait_for_timeout(1500)
-    look = server.looks[-1]
-    assert look["depth"] is True
-    left, right = (np.array(e["R"]).reshape(3, 3).T @ -np.array(e["T"]) for e in look["eyes"])
-    R = np.reshape(look["eyes"][0]["R"], (3, 3))
-    np.testing.assert_allclose(right - left, 0.06 * R[0], atol=1e-6)
-    np.testing.assert_allclose(left[1], 1.5, atol=1e-6)  # above the floor of the subject's box
-    np.testing.assert_allclose(R[1], [0, -1, 0], atol=1e-6)
-    assert R[2] @ (scene.CENTER - left) > 2  # it looks at the subject
-    assert look["eyes"][0]["fx"] == look["width"] / 2
-    page.evaluate("endSession()")
-    page.wait_for_timeout(500)
-    assert "camera" in server.looks[-1]
-    context.close()
+    with opened(browser, server, query="", script=HEADSET) as view:
+        view.page.wait_for_selector("#picture[data-frame]")
+        view.page.get_by_role("button", name="Enter VR").click()
+        view.until(lambda: "eyes" in server.looks[-1])
+        look = server.looks[-1]
+        assert look["depth"] is True
+        left, right = (np.array(e["R"]).reshape(3, 3).T @ -np.array(e["T"]) for e in look["eyes"])
+        R = np.reshape(look["eyes"][0]["R"], (3, 3))
+        np.testing.assert_allclose(right - left, 0.06 * R[0], atol=1e-6)
+        np.testing.assert_allclose(left[1], 1.5, atol=1e-6)  # above the floor of the subject's box
+        np.testing.assert_allclose(R[1], [0, -1, 0], atol=1e-6)
+        assert R[2] @ (scene.CENTER - left) > 2  # it looks at the subject
+        assert look["eyes"][0]["fx"] == look["width"] / 2
+        view.page.evaluate("endSession()")
+        view.until(lambda: "camera" in server.looks[-1])
 
 
 def test_a_session_that_ends_while_it_starts_leaves_the_page_as_it_was(browser, server):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from live.browser.conftest import SIZES, View, opened
+from live.browser.conftest import SIZES, THREE_REFRESHES, View, opened
 
 pytestmark = pytest.mark.slow
 KEEP_LOOKS = (
@@ -58,6 +58,7 @@ def view(browser, served, request) -> Iterator[View]:
 
 def rest(view: View) -> None:
     """Wait until the picture is the full answer to the page's last look, and the view rests."""
+    view.page.evaluate(THREE_REFRESHES)
     view.page.wait_for_timeout(60)
     view.until(ANSWERED)
     view.page.wait_for_timeout(200)

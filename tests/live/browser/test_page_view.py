@@ -115,8 +115,9 @@ def test_keys_turn_walk_zoom_and_reset(desktop):
     page, start = desktop.page, eye(desktop)
 
     def hold(key: str) -> None:
+        before = eye(desktop)
         page.keyboard.down(key)
-        page.wait_for_timeout(250)
+        desktop.until(lambda: np.linalg.norm(eye(desktop) - before) > 0.3)
         page.keyboard.up(key)
         desktop.settle()
 

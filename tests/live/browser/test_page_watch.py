@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from live.browser.conftest import View
+from live.browser.conftest import SCREENSHOT_S, View
 from live.live_servers import running
 
 from viewmend.live.client import Client
@@ -86,7 +86,7 @@ def test_the_tool_puts_this_page_on_air_and_tells_who_took_over(on_air, pages):
     assert f"{on_air.url}/watch" in view.page.locator("#toasts").inner_text()
     watching = pages(f"{on_air.url}/watch")
     watching.until(MOVES.format(1), 40)
-    watching.until(lambda: np.abs(ground(watching)[0] - (0, 0, 200)).max() < 12, 20)
+    watching.until(lambda: np.abs(ground(watching)[0] - (0, 0, 200)).max() < 12, SCREENSHOT_S)
     view.until("document.querySelector('#tool-air').dataset.watched === 'true'")
     sessions = on_air.live.registry.sessions
     loop, (before,) = on_air.server._uvicorn.servers[0].get_loop(), sessions
