@@ -20,7 +20,7 @@ from viewmend import (
 
 def main(folder: Path, frames: int = 3, size_px: int = 256) -> Path:
     """Complete the first camera's view from the others; write rendered, completed and true images side by side."""
-    # %% A capture is a folder in any supported format. If there is none, the studio makes a synthetic one.
+    # %% A capture is a folder in any supported format, with masks. If there is none, the studio makes a synthetic one.
     if not folder.exists():
         write_capture(Studio(StudioConfig(seed=10001, cameras=8, frames=frames, size_px=size_px)), folder)
     capture = open_capture(folder)

@@ -190,7 +190,7 @@ def run(command: list[str], limit_s: float) -> dict[str, object]:
 
 
 def failed(steps: dict[str, dict[str, object]]) -> list[str]:
-    """The names of the steps that failed. `windows` makes as many as it can, so its time is always over."""
+    """The names of the steps that failed. `windows` makes as many as it can, so it always runs out of time."""
     accepted = {"windows": (0, OUT_OF_TIME), "tests": (0, 5)}  # pytest's 5: there are none
     return [name for name, step in steps.items() if step["code"] not in accepted.get(name, (0,))]
 

@@ -221,7 +221,8 @@ def publish(
     poses: Cameras | None = None
     if config.completed_cameras:
         poses = with_finer_images(place_around(rig, first.proxy.center, up, config.completed_cameras))
-    page_bytes = _write_page(out, config.title, count > 1) + _write_poster(
+    version = secrets.token_hex(4)
+    page_bytes = _write_page(out, config.title, count > 1, version) + _write_poster(
         out, stream, home, first.frame.time
     )
     budget = SizeBudget(1e6 * config.max_mb - page_bytes - SCENE_BYTES, count)
@@ -238,7 +239,7 @@ def publish(
     if motion.box is None:
         raise ValueError("expected a frame that shows a subject, got none; choose other --frames")
     fps = config.fps if count > 1 else None
-    rig_message = rig_json(config.title, rig, motion.box, home, fps, secrets.token_hex(4))
+    rig_message = rig_json(config.title, rig, motion.box, home, fps, version)
     scene = {"rig": rig_message, "frames": len(frame_bytes), "motion": bounds_json(motion.box)}
     text = json.dumps(scene, separators=(",", ":"), allow_nan=False).encode()
     (out / "scene.json").write_bytes(text)
@@ -251,7 +252,7 @@ def publish(
     )
 
 
-def _write_page(out: Path, title: str, moves: bool) -> int:
+def _write_page(out: Path, title: str, moves: bool, version: str) -> int:
     """Write the page; returns its size in bytes."""
     files = page_files()
     written = 0
@@ -264,12 +265,12 @@ def _write_page(out: Path, title: str, moves: bool) -> int:
     modules = [
         name for name in files if name.endswith(".js") and name not in LIVE_FILES and "worker" not in name
     ]
-    page = published_html(files["index.html"].content.decode(), title, modules, moves).encode()
+    page = published_html(files["index.html"].content.decode(), title, modules, moves, version).encode()
     (out / "index.html").write_bytes(page)
     return written + len(page)
 
 
-def published_html(live_html: str, title: str, modules: Sequence[str], moves: bool) -> str:
+def published_html(live_html: str, title: str, modules: Sequence[str], moves: bool, version: str) -> str:
     """The page of a published performance, from the live one.
 
     Args:
@@ -277,6 +278,7 @@ def published_html(live_html: str, title: str, modules: Sequence[str], moves: bo
         title: the performance's title, as text.
         modules: the scripts to load at once, by their paths.
         moves: whether there are several frames, and hence a time line.
+        version: differs between performances, so that no poster of an earlier one comes from a cache.
     """
     text = html.escape(title)
     preload = "\n".join(f'  <link rel="modulepreload" href="page/{name}">' for name in modules)
@@ -285,7 +287,7 @@ def published_html(live_html: str, title: str, modules: Sequence[str], moves: bo
   <meta property="og:title" content="{text}">
   <meta property="og:image" content="poster.jpg">"""
     kind = "poster" if moves else "poster still"
-    poster = f"""    <img class="{kind}" id="poster" src="poster.jpg" alt="{text}">
+    poster = f"""    <img class="{kind}" id="poster" src="poster.jpg?v={version}" alt="{text}">
     <div class="labels" id="labels">"""
     says = f'document.getElementById("cover-title").textContent = "{FILE_NOTICE}"'
     file_script = f'if (location.protocol === "file:") {says};'

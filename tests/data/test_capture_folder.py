@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference.films import write_film
 
 from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
@@ -289,6 +290,16 @@ def test_the_rate_is_that_of_the_videos(plain, stated, expected):
     plain.description |= {"fps": stated, "frames": [f"{n:03d}" for n in range(4)]}
     plain.save()
     assert open_capture(plain.path).fps == pytest.approx(expected)
+
+
+def test_a_stated_rate_holds_for_videos_without_times(plain):
+    frames = [np.zeros((32, 40, 3), np.uint8)] * 6
+    for view, name in enumerate("abcd"):
+        write_film(plain.path / f"{name}.h264", frames, fps=30)
+        update(plain, view, video=f"{name}.h264", image=None, mask=None)
+    plain.description |= {"fps": 60, "frames": [f"{n:03d}" for n in range(6)]}
+    plain.save()
+    assert open_capture(plain.path).fps == 60
 
 
 def test_written_videos_keep_size_and_colour(tmp_path):

@@ -239,7 +239,7 @@ def test_frames_that_are_not_used_are_counted(studio, tmp_path, capsys):
     sorted((folder / "mask" / studio[1].names[0]).iterdir())[1].unlink()
     frames, _ = calibrate_command._frames(calibrate_command.Options(source=folder, out=tmp_path / "out"))
     assert [len(frame.cameras) for frame in frames] == [8]
-    assert "1 of 2 frames are used" in capsys.readouterr().err
+    assert "of 2 chosen frames, 1 are used" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,7 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
         )
     if len(frames) < count:
         say(
-            f"{len(frames)} of {count} frames are used: the others show no subject or lack one of {len(most)} cameras"
+            f"of {count} chosen frames, {len(frames)} are used: the others show no subject or lack some of the "
+            f"{len(most)} cameras"
         )
     return frames, capture.bounds

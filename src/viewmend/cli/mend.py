@@ -328,7 +328,10 @@ def _find_usable_frames(capture: "CaptureFolder", times: range, held: tuple[str,
         )
     if left_out:
         count = f"{len(left_out)} of {len(times)} frames"
-        say(f"{count} have fewer than two input cameras and are skipped; the first is '{left_out[0]}'")
+        say(
+            f"{count} have fewer than two input cameras and are skipped, which shortens the result; "
+            f"the first is '{left_out[0]}'"
+        )
     return usable
 
 

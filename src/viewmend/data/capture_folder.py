@@ -397,8 +397,9 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 
 
 def _choose_fps(stated_fps: float | None, clock: VideoClock) -> float | None:
-    """The rate of the frames: as stated, unless it is not that of the clock's times."""
-    if stated_fps is None or clock.fps is None:
+    """The rate of the frames: as stated, unless videos have times of another rate."""
+    has_times = any(track.is_timed for track in clock.tracks)
+    if stated_fps is None or clock.fps is None or not has_times:
         return stated_fps or clock.fps
     return stated_fps if abs(clock.fps / stated_fps - 1) < RATE_TOLERANCE else clock.fps
 

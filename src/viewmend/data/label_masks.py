@@ -21,8 +21,8 @@ class LabelMaskRule:
     max_labels: int = MAX_LABELS
     """Masks without an opaque pixel hold labels if they have at most this many values in all."""
     min_compact: float = 0.5
-    """Masks of which none is opaque hold labels if at least this share of the foreground has more of it to
-    the right and below; noise has not."""
+    """Masks of which none is opaque hold labels only if at least this share of the foreground has foreground
+    to its right and below it; noise has less."""
     min_share: float = 0.005
     """A single mask holds a label only if at least this share of its pixels has it, and at least
     this share is 0."""
@@ -57,9 +57,9 @@ class LabelMasks:
     def convert(self, mask: Masks) -> ConvertedMasks | None:
         """The masks of a frame with labels as 255; None if they stay as they are.
 
-        As long as no mask was opaque, all masks hold labels if they have few values, in areas, and have a
-        low opaque level if nearly all of their foreground is at one level. Once a mask was opaque, each
-        other mask is judged by itself: it holds a label if it consists of 0 and one low value.
+        As long as no mask was opaque, all masks hold labels if they have few values and these form areas;
+        they have a low opaque level if nearly all of their foreground is at one level. Once a mask was
+        opaque, each other mask is judged by itself: it holds a label if it consists of 0 and one low value.
         """
         highest = mask.flatten(1).amax(1).tolist()
         self._seen_opaque = self._seen_opaque or max(highest) >= self._rule.opaque

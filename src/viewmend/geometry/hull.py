@@ -357,8 +357,8 @@ def bounds_from_cameras(cameras: Cameras) -> Bounds:
 def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bounds:
     """A cube that holds the masks' subject: centred where the rays through the masks' middles come closest.
 
-    If fewer than two masks have any foreground, or these rays meet behind the cameras, because the
-    foreground is not one subject, that of `bounds_from_cameras`.
+    The cube of `bounds_from_cameras` if fewer than two masks have foreground, or if the rays meet behind
+    all cameras, as with masks of different things.
 
     Raises:
         ValueError: there is one camera only, or the cameras look away from each other.

@@ -291,8 +291,8 @@ class HeldBackValidation:
             self._views = [view for place in self.captures for view in held_back_views(place, self.hold_out)]
         if not self._views:
             raise ValueError(
-                "expected a subject in what is held back, got none; choose another --hold-out, or cut the frames "
-                "without a subject at the end"
+                "expected a view of the subject in what is held back, got none; use more cameras or frames, or "
+                "choose another --hold-out"
             )
         self._metric = self._metric or load_lpips("alex")
         training = model.training

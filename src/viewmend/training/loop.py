@@ -381,22 +381,23 @@ class Run:
         first_scores = log.first_validation() or scores
         if TRAINED_SCORE in scores:
             scores |= {"overfit": memorised_gain(scores, first_scores)}
-        log.add_validation(step, scores)
         self.last_scores = scores
         score = scores.get("score")
         best = self.state.best_score
         if self.keeps_best and score is not None and is_better(score, best):
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(replace(self.state, step=step, elapsed_s=clock.elapsed_s()))
+        log.add_validation(step, scores)  # last, as a resumed run does not score a logged step again
 
     def _validate_last_steps(self, log: Log, step: int, clock: RunClock) -> None:
         """Validate the last weights; if they are the best, save again, because a checkpoint holds the best score.
 
-        If a run that keeps the best weights was killed here, it catches up when it is resumed. Every process
-        calls this: only the first validates, but all take part in saving.
+        If a complete run that keeps the best weights was killed here, it catches up when it is resumed. Every
+        process calls this: only the first validates, but all take part in saving.
         """
         has_better_weights = 0.0
-        if self.validation is not None and (step > clock.first_step or self.keeps_best):
+        is_complete = clock.progress(step) >= 1 or self._has_stopped_improving(step)
+        if self.validation is not None and (step > clock.first_step or (self.keeps_best and is_complete)):
             scored_steps = [scored for scored, _ in read_validations(self.out)]
             if step not in scored_steps:
                 self._validate(log, step, clock)

@@ -81,8 +81,8 @@ def rays() -> TrainConfig:
 def paper() -> TrainConfig:
     """The paper's model at its full size, with the paper's objective; for a data-centre GPU.
 
-    M_t is given for a third of the held-out cameras, and carves another third's hulls; with
-    --captures, all scenes are captures.
+    M_t is given for a third of the held-out cameras; for another third, it only helps to carve the
+    hull. With --captures, all scenes are captures.
     """
     return TrainConfig(
         name="paper",

@@ -173,10 +173,18 @@ def _agreeing(
 
 def _silhouettes(small: Masks, cameras: Cameras, bounds: Bounds | None, views: list[int]) -> Silhouettes:
     """The silhouettes, in all cameras, of the hull of some of them; empty without a hull."""
+    return silhouettes_of(small[views], cameras[views], bounds, cameras, HULL)
+
+
+def silhouettes_of(
+    mask: Masks, cameras: Cameras, bounds: Bounds | None, targets: Cameras, config: HullConfig
+) -> Silhouettes:
+    """The silhouettes, in the targets, of the hull of masks; empty if the cameras look at no common place."""
     try:
-        return reconstruct(small[views], cameras[views], bounds, HULL).depth(cameras) > 0
+        return reconstruct(mask, cameras, bounds, config).depth(targets) > 0
     except ValueError:
-        return torch.zeros_like(small, dtype=torch.bool)
+        width, height = targets.max_size_px
+        return torch.zeros(len(targets), height, width, dtype=torch.bool)
 
 
 def _covered(small: Masks, silhouettes: Silhouettes, views: list[int]) -> Shares:

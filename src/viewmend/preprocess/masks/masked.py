@@ -11,8 +11,7 @@ import torch
 from viewmend.data.source import CaptureSource, CaptureWrapper
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import FOREGROUND
-from viewmend.geometry.proxy import reconstruct
+from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.preprocess.masks.consensus import (
     MaskNear,
     Masks,
@@ -21,6 +20,7 @@ from viewmend.preprocess.masks.consensus import (
     put,
     reduced,
     settle_masks,
+    silhouettes_of,
     widened,
 )
 from viewmend.preprocess.masks.maker import Inside, Mask, MaskMaker, Rgb, lasting, without_spill
@@ -62,7 +62,7 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
         groups = max(1, len(others) // GROUP)
         target = small_cameras[view]
         seen = [
-            _silhouette(small[group], small_cameras[group], bounds, target)
+            silhouettes_of(small[group], small_cameras[group], bounds, target, HullConfig())[0].numpy()
             for group in (others[first::groups] for first in range(groups if len(others) > 1 else 0))
         ]
         if any(one.any() for one in seen):
@@ -71,15 +71,6 @@ def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tup
             yield some, all_
         else:
             yield None
-
-
-def _silhouette(mask: Masks, cameras: Cameras, bounds: Bounds | None, target: Cameras) -> Inside:
-    """The silhouette, in one more camera, of the hull of these masks; empty without a hull."""
-    try:
-        return reconstruct(mask, cameras, bounds).depth(target)[0].numpy() > 0
-    except ValueError:  # the rays through the middles of the masks do not meet
-        width, height = target.max_size_px
-        return np.zeros((height, width), bool)
 
 
 def _judged(own: Mask, some: Inside, all_: Inside) -> Mask:
