@@ -63,11 +63,11 @@ def test_a_signal_waits_until_the_results_are_in_place(tmp_path, monkeypatch):
     rename = Path.rename
 
     def disturbed(path, target):
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
         return rename(path, target)
 
     monkeypatch.setattr(Path, "rename", disturbed)
-    with pytest.raises(KeyboardInterrupt):
+    with console.exit_on_sigterm(), pytest.raises(SystemExit):
         published(tmp_path / "out")
     assert seen(tmp_path / "out") == ["pictures/0.png", "pictures/1.png", "sheet.png"]
     assert (tmp_path / "out/sheet.png").read_text() == "sheet of 2"
