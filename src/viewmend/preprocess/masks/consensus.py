@@ -178,7 +178,7 @@ def _silhouettes(small: Masks, cameras: Cameras, bounds: Bounds | None, views: l
 
 def silhouettes_of(
     mask: Masks, cameras: Cameras, bounds: Bounds | None, targets: Cameras, config: HullConfig
-) -> Silhouettes:
+) -> Bool[Tensor, "target rows columns"]:
     """The silhouettes, in the targets, of the hull of masks; empty if the cameras look at no common place."""
     try:
         return reconstruct(mask, cameras, bounds, config).depth(targets) > 0
