@@ -171,8 +171,8 @@ def test_a_person_whom_one_camera_finds_is_not_denied_by_the_others(studio):
     images = [view_rgb(frame, view) for view in range(4)]
     settled = settle_masks(masks, images, frame.cameras, None, mask_near)
     assert set(settled.without) == set(frame.cameras.names[1:]) and torch.equal(settled.mask, masks)
-    nobody = settle_masks(torch.zeros_like(masks), images, frame.cameras, None, mask_near)
-    assert not nobody.without, "an empty stage"
+    empty_stage = settle_masks(torch.zeros_like(masks), images, frame.cameras, None, mask_near)
+    assert not empty_stage.without, "no camera is left out where none sees a person"
 
 
 def test_an_image_of_one_pixel_in_width_has_nobody():

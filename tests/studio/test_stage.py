@@ -1,5 +1,7 @@
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from viewmend.data.errors import CaptureError
 from viewmend.geometry.cameras import project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rigid import is_rotation, rigid, rotation_from_axis_angle
+from viewmend.studio import stage
 from viewmend.studio.gltf_performer import GltfPerformer
 from viewmend.studio.imperfections import Imperfections
 from viewmend.studio.performer import BoundMesh, TexturedMesh
+from viewmend.studio.render import Surface
 from viewmend.studio.rigs import dome_rig, orbit, ring_rig
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -238,3 +242,20 @@ def test_posing_is_the_weighted_mean_of_rigid_motions(rng):
     torch.testing.assert_close(bound.skin(motions).mesh.vertices, expected)
     moved_by_one = replace(bound, joints=torch.full_like(joints, 2)).skin(motions)
     torch.testing.assert_close(moved_by_one.normals, normals @ motions[2, :3, :3].T)
+
+
+def test_threads_that_draw_different_times_get_their_own(monkeypatch):
+    """As a program that reads ahead while it draws the truth of the last time."""
+
+    def light(scene, lights, pyramid) -> Surface:
+        surface = Surface.__new__(Surface)
+        object.__setattr__(surface, "drawn", torch.full((10000,), scene.time))
+        return surface
+
+    studio = Studio(StudioConfig(cameras=2, frames=2, size_px=32))
+    monkeypatch.setattr(studio, "scene", lambda time: SimpleNamespace(time=time, textures=()))
+    monkeypatch.setattr(stage, "texture_pyramid", lambda textures: None)
+    monkeypatch.setattr(stage, "light", light)
+    with ThreadPoolExecutor(2) as pool:
+        drawn = pool.map(lambda time: {int(studio._surface(time).drawn[0]) for _ in range(5000)}, range(2))
+        assert list(drawn) == [{0}, {1}]

@@ -200,13 +200,19 @@ class Studio:
         return replace(render(self._surface(time), cameras, behind, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
-        if self._last_surface is None or self._last_surface[0] != time:
-            scene = self.scene(time)
-            pyramid = self._last_pyramid
-            if pyramid is None or [*map(id, pyramid[0])] != [*map(id, scene.textures)]:
-                pyramid = self._last_pyramid = scene.textures, texture_pyramid(scene.textures)
-            self._last_surface = time, light(scene, self._lights, pyramid[1])
-        return self._last_surface[1]
+        # Another thread may draw another time, so each attribute is read once. Even replacing the last surface
+        # lets it run, because tensors are freed without the GIL.
+        last = self._last_surface
+        if last is not None and last[0] == time:
+            return last[1]
+        scene = self.scene(time)
+        pyramid = self._last_pyramid
+        if pyramid is None or [*map(id, pyramid[0])] != [*map(id, scene.textures)]:
+            pyramid = scene.textures, texture_pyramid(scene.textures)
+            self._last_pyramid = pyramid
+        surface = light(scene, self._lights, pyramid[1])
+        self._last_surface = time, surface
+        return surface
 
 
 def _cast(config: StudioConfig, seed: int) -> Performer:
