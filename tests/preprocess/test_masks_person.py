@@ -175,7 +175,7 @@ def test_a_person_whom_one_camera_finds_is_not_denied_by_the_others(studio):
     assert not empty_stage.without, "no camera is left out where none sees a person"
 
 
-def test_an_image_of_one_pixel_in_width_has_nobody():
+def test_no_person_is_found_in_an_image_of_one_pixel_in_width():
     assert not PersonMasks().mask(np.zeros((64, 1, 3), np.uint8)).any()
 
 
