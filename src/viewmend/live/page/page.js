@@ -503,7 +503,9 @@ class Page {
     const framesPerMs = (fps * transport.state.speed) / 1000;
     const live = transport.state.kind === "live";
     assets.request(time, eye, range, { playing, framesPerMs, live });
-    if (playing && assets.waitsForFrames && assets.updateBuffering(time, eye, range)) this.link.holdAt(time);
+    if (assets.waitsForFrames) {
+      this.link.setBuffering(playing && assets.updateBuffering(time, eye, range), time);
+    }
 
     // draw the newest frame whose assets have arrived, or keep the last one
     const maxDelay = playing && !assets.waitsForFrames ? Math.ceil(2 * fps) : 0;

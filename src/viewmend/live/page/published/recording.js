@@ -28,6 +28,8 @@ export class Recording extends EventTarget {
     this.lastRequest = "";
     this.playing = true;
     this.speed = 1;
+    /** Whether the clock waits for frames, as it does until the first ones have arrived. */
+    this.buffering = true;
     /** The position at a moment, in frames. */
     this.anchor = { position: 0, at: performance.now() };
     /** Opens the performance again after an error; 0 while there is none. */
@@ -49,7 +51,6 @@ export class Recording extends EventTarget {
       return;
     }
     if (isFirst) {
-      this.anchor.at = performance.now();
       setInterval(() => this.#reportState(), STATE_MS);
       window.addEventListener("hashchange", () => this.#showUrl());
     }
@@ -84,8 +85,14 @@ export class Recording extends EventTarget {
     this.#reportState();
   }
 
-  /** Wait at a frame that is not available yet. @param {number} time */
-  holdAt(time) {
+  /**
+   * Wait at a frame that has not arrived yet, or play on from it.
+   * @param {boolean} buffering whether to wait
+   * @param {number} time
+   */
+  setBuffering(buffering, time) {
+    if (buffering === this.buffering) return;
+    this.buffering = buffering;
     this.#setPosition(time);
     this.#reportState();
   }
@@ -114,7 +121,8 @@ export class Recording extends EventTarget {
   #computePosition() {
     const { frames, rig } = this.scene;
     const seconds = (performance.now() - this.anchor.at) / 1000;
-    const played = this.playing ? seconds * this.speed * (rig.fps ?? 0) : 0;
+    const runs = this.playing && !this.buffering;
+    const played = runs ? seconds * this.speed * (rig.fps ?? 0) : 0;
     return (this.anchor.position + played) % frames;
   }
 
@@ -143,6 +151,7 @@ export class Recording extends EventTarget {
       live: playing && speed === 1,
       behind: 0,
       time: Math.floor(this.#computePosition()),
+      buffering: this.buffering,
     });
   }
 

@@ -137,7 +137,8 @@ export class Notices {
       return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     }
     const late = this.waitingSince && performance.now() - this.waitingSince > LATE_MS;
-    if (late || state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };
+    if (late) return { kind: "wait", title: "Waiting for the server", text: "" };
+    if (state.buffering) return { kind: "wait", title: "Waiting for frames", text: "" };
     return { kind: "fine", title: "", text: "" };
   }
 }

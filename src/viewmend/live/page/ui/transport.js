@@ -105,21 +105,21 @@ export class Transport {
   }
 
   /**
-   * Advance the position, and correct its difference from the server's clock.
+   * Advance the position, and correct its difference from the server's clock; wait where that waits.
    * @param {number} now ms
    * @param {number} fps
    */
   #followClock(now, fps) {
     const { state, serverClock } = this;
     const count = state.end - state.first;
-    const framesPerMs = (fps * state.speed) / 1000;
+    const framesPerMs = state.buffering ? 0 : (fps * state.speed) / 1000;
     const loops = state.end === state.total;
     this.position += (now - this.positionAt) * framesPerMs;
     this.positionAt = now;
     const serverPosition = serverClock.time + 0.5 + (now - serverClock.at) * framesPerMs;
     const frames = serverPosition - this.position;
     const difference = loops ? frames - count * Math.round(frames / count) : frames;
-    const jumps = Math.abs(difference) > Math.max(MAX_DIFFERENCE, fps / 3);
+    const jumps = state.buffering || Math.abs(difference) > Math.max(MAX_DIFFERENCE, fps / 3);
     this.position += jumps ? difference : CORRECTION * difference;
     if (loops) {
       const offset = this.position - state.first;
