@@ -77,12 +77,11 @@ export class Recording extends EventTarget {
 
   /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} change */
   changeClock({ playing, speed, seek, live }) {
-    const position = seek ?? this.#computePosition();
-    this.#setPosition(Math.min(position, this.scene.frames - 1));
+    if (this.scene) this.#setPosition(Math.min(seek ?? this.#computePosition(), this.scene.frames - 1));
     if (speed !== undefined) this.speed = speed;
     if (playing !== undefined) this.playing = playing;
     if (live) this.playing = true;
-    this.#reportState();
+    if (this.scene) this.#reportState();
   }
 
   /**

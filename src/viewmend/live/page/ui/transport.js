@@ -176,7 +176,8 @@ export class Transport {
    */
   #current(name, otherwise) {
     const requested = this.requested[name];
-    if (requested && performance.now() - requested.at < OVERRIDE_MS) return requested.value;
+    const isNew = requested && (!this.state || performance.now() - requested.at < OVERRIDE_MS);
+    if (isNew) return requested.value;
     return this.state?.[name] ?? otherwise;
   }
 
