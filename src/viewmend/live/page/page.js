@@ -82,6 +82,8 @@ class Page {
 
     // scheduling of repaints
     this.resolution = new Resolution();
+    /** Canvas pixels per CSS pixel at the last repaint. */
+    this.paintedRatio = 0;
     this.repaints = new RepaintLimiter(this.stage.software);
     this.refreshedAt = 0;
     this.scheduled = false;
@@ -484,6 +486,12 @@ class Page {
     return this.motion.moving || (this.transport.playing && this.transport.shown >= 0);
   }
 
+  /** Canvas pixels per CSS pixel; a slow device lowers them while the view moves or plays. */
+  get pixelRatio() {
+    const full = Math.min(2, window.devicePixelRatio);
+    return this.isActive && this.settings.get("adaptive") ? full * this.resolution.factor : full;
+  }
+
   /** Choose the frame to draw, and request the next ones. @param {number} now ms */
   chooseFrame(now) {
     const { transport, motion, assets } = this;
@@ -579,7 +587,8 @@ class Page {
 
     // fit the canvas to the page
     const { width, height } = this.layout.page;
-    const ratio = this.resolution.ratio;
+    const ratio = this.pixelRatio;
+    this.paintedRatio = ratio;
     const canvasWidth = Math.round(width * ratio);
     const canvasHeight = Math.round(height * ratio);
     if (this.canvas.width !== canvasWidth) this.canvas.width = canvasWidth;
@@ -658,7 +667,8 @@ class Page {
     this.requestView();
 
     // paint if anything has changed
-    if (this.stale || changes || this.drawn !== last) {
+    const sharpens = this.pixelRatio !== this.paintedRatio;
+    if (this.stale || changes || sharpens || this.drawn !== last) {
       this.stale = false;
       this.paint();
     }

@@ -15,7 +15,7 @@ const MIN_FACTOR = 0.5;
  */
 const SOFTWARE_MS = 25;
 
-/** Chooses the number of canvas pixels per CSS pixel. */
+/** Chooses the share of the display's resolution that a moving view has. */
 export class Resolution {
   constructor() {
     /** The share of the display's resolution. */
@@ -24,11 +24,6 @@ export class Resolution {
     this.mean = 20;
     /** Refreshes in a row. */
     this.count = 0;
-  }
-
-  /** Canvas pixels per CSS pixel. */
-  get ratio() {
-    return Math.min(2, window.devicePixelRatio) * this.factor;
   }
 
   /**
