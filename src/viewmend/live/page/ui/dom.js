@@ -79,9 +79,22 @@ export function setUpRadioGroup(group, choose) {
       const checked = button.dataset.value === value;
       button.setAttribute("aria-checked", String(checked));
       button.tabIndex = checked ? 0 : -1;
-      if (checked) button.scrollIntoView({ block: "nearest", inline: "nearest" });
+      if (checked) scrollTo(group, button);
     }
   };
+}
+
+/**
+ * Scroll a strip until it shows one of its buttons; `scrollIntoView` would also scroll a page around it.
+ * @param {HTMLElement} strip
+ * @param {HTMLElement} button
+ */
+function scrollTo(strip, button) {
+  const shown = strip.getBoundingClientRect();
+  const wanted = button.getBoundingClientRect();
+  const hiddenLeft = Math.max(0, shown.left - wanted.left);
+  const hiddenRight = Math.max(0, wanted.right - shown.right);
+  strip.scrollLeft += hiddenRight - hiddenLeft;
 }
 
 /**
