@@ -468,12 +468,12 @@ class Page {
 
   // Drawing
 
-  /** Whether the page itself draws the moving views. */
+  /** Whether the page itself draws the moving views; without a server also while files fail. */
   get drawing() {
-    const { settings, assets } = this;
+    const { settings, assets, source } = this;
     return (
       settings.renderedModes.every((mode) => DRAWN_MODES.includes(mode)) &&
-      assets.usable &&
+      (assets.usable || !source.live) &&
       settings.get("render") === "page" &&
       !this.headset.session &&
       !this.onAir.wanted &&

@@ -15,7 +15,8 @@ import { dot, sub, unit } from "../view/matrix.js";
  *   the server no longer has; "mesh" for its fused mesh
  * @property {Frame | null} fused the same frame with the mesh that the server fused from predicted depth
  * @property {number} requestedAt ms
- * @property {boolean} failed whether a request failed a short time ago
+ * @property {boolean} failed whether a request that its view needs failed a short time ago
+ * @property {Set<number>} lost numbers of other images whose request failed a short time ago
  */
 
 /** This many frames are kept. */
@@ -129,6 +130,8 @@ export class Assets extends EventTarget {
     this.without = "";
     /** The frames by index; those used last are at the end. @type {Map<number, Frame>} */
     this.frames = new Map();
+    /** The position of the view at the last request, in metres. */
+    this.eye = [0, 0, 0];
     /** The frame that is shown, which is kept. @type {Frame | null} */
     this.shown = null;
     /** Keys of the requests that have no answer yet. @type {Set<string>} */
@@ -258,6 +261,7 @@ export class Assets extends EventTarget {
    *   requested
    */
   request(time, eye, { first, end }, { playing, framesPerMs, live }) {
+    this.eye = eye;
     const count = Math.max(1, end - first);
     const playsAhead = playing && !live;
     // frames that would arrive too late
@@ -308,7 +312,7 @@ export class Assets extends EventTarget {
    * @returns {boolean} whether none is missing
    */
   #load(frame, eye, playing) {
-    const { shape, images, time } = frame;
+    const { shape, images, lost, time } = frame;
     if (!shape) {
       this.#requestAsset(`${time}`, null);
       return false;
@@ -317,7 +321,7 @@ export class Assets extends EventTarget {
     const wanted = drawsFirst
       ? this.findNeededCameras(frame, eye)
       : this.#listWantedCameras(shape, eye, playing);
-    const missing = [...new Set(wanted)].filter((n) => !images.has(n));
+    const missing = [...new Set(wanted)].filter((n) => !images.has(n) && !lost.has(n));
     for (const n of missing) this.#requestAsset(`${time}/${n}`, shape.header.cameras[n]);
     if (missing.length === 0) this.#loadExtra(frame, eye);
     return missing.length === 0;
@@ -397,6 +401,7 @@ export class Assets extends EventTarget {
       fused: null,
       requestedAt: performance.now(),
       failed: false,
+      lost: new Set(),
     };
     this.frames.set(time, frame);
     for (const oldest of this.frames.values()) {
@@ -430,7 +435,7 @@ export class Assets extends EventTarget {
     if (frame) this.#store(frame, part, result);
     else image?.picture.close();
     if (frame && !frame.failed) {
-      this.failures = shape ? 0 : this.failures;
+      this.failures = shape || image ? 0 : this.failures;
       this.bytes += bytes ?? 0;
       if (image && frame.images.size === frame.shape?.header.blend.cameras) {
         this.latency += NEWEST_WEIGHT * (performance.now() - frame.requestedAt - this.latency);
@@ -461,7 +466,7 @@ export class Assets extends EventTarget {
     } else if (image) {
       frame.images.set(number, image);
     } else if (failed !== undefined) {
-      this.#fail(frame);
+      this.#fail(frame, number);
     }
   }
 
@@ -477,14 +482,25 @@ export class Assets extends EventTarget {
     frame.fused = { ...frame, shape: { ...mesh, header } };
   }
 
-  /** Try a frame again later; it counts once, however many of its assets fail. @param {Frame} frame */
-  #fail(frame) {
-    if (frame.failed) return;
-    frame.failed = true;
-    this.failures += 1;
+  /**
+   * Try an asset again later. A frame counts as failed once, however many of the assets fail that its view
+   * needs.
+   * @param {Frame} frame
+   * @param {number} number of the camera
+   */
+  #fail(frame, number) {
+    const needed = !frame.shape || this.findNeededCameras(frame, this.eye).includes(number);
+    if (needed && frame.failed) return;
+    if (needed) {
+      frame.failed = true;
+      this.failures += 1;
+    } else {
+      frame.lost.add(number);
+    }
     setTimeout(() => {
       if (this.frames.get(frame.time) === frame && !frame.shape) this.frames.delete(frame.time);
-      frame.failed = false;
+      if (needed) frame.failed = false;
+      frame.lost.delete(number);
       this.dispatchEvent(new CustomEvent("change", { detail: frame }));
     }, RETRY_MS);
   }
