@@ -221,6 +221,15 @@ export class Assets extends EventTarget {
   }
 
   /**
+   * Whether the images that fill the holes of what is shown have arrived, too.
+   * @param {Frame} frame that is drawable
+   * @param {number[]} eye
+   */
+  isFilled({ shape, images }, eye) {
+    return this.#listWantedCameras(/** @type {Shape} */ (shape), eye, true).every((n) => images.has(n));
+  }
+
+  /**
    * Find the numbers of the cameras that colour what is shown.
    * @param {Frame} frame whose shape has arrived
    * @param {number[]} eye

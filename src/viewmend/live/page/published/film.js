@@ -142,10 +142,8 @@ export class CanvasFilm {
     while (!this.stopped) {
       assets.request(time, eye, range, { playing: true, framesPerMs: 0, live: false });
       const frame = assets.choose(time, eye, range, 0);
-      if (frame) {
-        assets.shown = frame;
-        return frame;
-      }
+      if (frame) assets.shown = frame;
+      if (frame && assets.isFilled(frame, eye)) return frame;
       if (performance.now() > deadline || !assets.usable) {
         throw new Error("files of the performance are out of reach");
       }
