@@ -197,6 +197,7 @@ class Page {
     });
     listen(link, "completed", (message) => this.assets.addCompleted(message));
     listen(link, "show", (view) => this.show(view));
+    listen(link, "link", (query) => this.showLink(query));
     listen(link, "stats", (stats) => (this.statistics.server = stats));
     listen(link, "error", ({ message }) => this.notices.toast(message, "error"));
     listen(link, "picture", (shown) => this.takeFrame(shown));
@@ -270,6 +271,17 @@ class Page {
     }
     if (time !== undefined) transport.pauseAt(time);
     if (mode && this.source.modes.includes(mode)) settings.set("mode", mode, false);
+    this.wake();
+  }
+
+  /** Show the view of a link, as a page that is opened with it does. @param {URLSearchParams} query */
+  showLink(query) {
+    const { motion, transport } = this;
+    this.settings.readUrl(query);
+    const time = parseFrameIndex(query.get("time"));
+    if (time < 0) transport.goLive();
+    else transport.pauseAt(time);
+    motion.moveTo(parsePose(query.get("pose")) ?? motion.computeHome());
     this.wake();
   }
 

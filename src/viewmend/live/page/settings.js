@@ -109,6 +109,7 @@ export class Settings extends EventTarget {
    */
   constructor(query, modes, live) {
     super();
+    this.modes = modes;
     this.stored = live;
     /** @type {any} */
     this.values = { ...DEFAULTS };
@@ -122,6 +123,12 @@ export class Settings extends EventTarget {
       else if (typeof standard === "number" || name === "topK") this.values[name] = Number(text) || standard;
       else this.values[name] = text;
     }
+  }
+
+  /** Take the settings that are part of the URL from a link. @param {URLSearchParams} query */
+  readUrl(query) {
+    const linked = new Settings(query, this.modes, this.stored);
+    for (const name of URL_SETTINGS) this.set(/** @type {keyof Choices} */ (name), linked.get(name));
   }
 
   /** @param {keyof Choices} name @returns {any} */

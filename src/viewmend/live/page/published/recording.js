@@ -1,7 +1,6 @@
 // The clock of a published performance, which takes the place of a server's messages "rig" and "state".
 
 import { add, length, scale, sub } from "../view/matrix.js";
-import { parsePose, parseFrameIndex } from "../view/url_state.js";
 
 /** The state is dispatched at this interval, in milliseconds. */
 const STATE_MS = 500;
@@ -14,7 +13,7 @@ const MIN_RADII = 1.2;
 
 /**
  * Replaces the connection and the link to a server. Events: "rig" and "state", as link/viewer.js dispatches
- * them; "show" if the URL was changed; and "status", as link/connection.js does.
+ * them; "link" (detail: its query) if the URL was changed; and "status", as link/connection.js does.
  */
 export class Recording extends EventTarget {
   /** @param {() => Promise<Response>} load fetches scene.json */
@@ -52,7 +51,9 @@ export class Recording extends EventTarget {
     }
     if (isFirst) {
       setInterval(() => this.#reportState(), STATE_MS);
-      window.addEventListener("hashchange", () => this.#showUrl());
+      window.addEventListener("hashchange", ({ newURL }) => {
+        this.#dispatch("link", new URLSearchParams(new URL(newURL).hash.slice(1)));
+      });
     }
     this.#reportStatus("open", "");
     this.#dispatch("rig", this.scene.rig);
@@ -123,17 +124,6 @@ export class Recording extends EventTarget {
     const runs = this.playing && !this.buffering;
     const played = runs ? seconds * this.speed * (rig.fps ?? 0) : 0;
     return (this.anchor.position + played) % frames;
-  }
-
-  /** Show the view of the URL, which was changed. */
-  #showUrl() {
-    const query = new URLSearchParams(location.hash.slice(1));
-    const time = parseFrameIndex(query.get("time"));
-    this.#dispatch("show", {
-      pose: parsePose(query.get("pose")),
-      mode: query.get("mode") ?? "completed",
-      ...(time < 0 ? {} : { time }),
-    });
   }
 
   #reportState() {
