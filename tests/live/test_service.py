@@ -10,7 +10,7 @@ from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera, FrameTimes
 from viewmend.live.render_jobs import RenderJob
-from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
+from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
 from viewmend.models.base import RenderQuality, State
 from viewmend.utils.cancellation import stop_if_cancelled
@@ -99,6 +99,30 @@ def test_a_failure_is_reported_to_its_session_only(service):
     assert log == ["a"] * 3 and unlucky.failures == ["RuntimeError: bad luck"] * 3 and len(odd.failures) >= 3
     assert service.counts == {"errors": 3, "frames": 3, "shared": 0, "cancelled": 0}
     assert (service.times.encode, service.times.rendering, service.times.total) == (6.0, 12.0, 27.0)
+
+
+@pytest.mark.parametrize(("error", "is_shared"), [(ValueError, False), (MemoryError, True)])
+def test_an_error_of_one_request_is_not_the_services(service, monkeypatch, error, is_shared):
+    def fail(request, viewer):
+        raise error("mine")
+
+    session = Eager("a", [])
+    service.join(session)
+    monkeypatch.setattr(service.renderer, "render", fail)
+    assert service.serve_next() and session.failures == [f"{error.__name__}: mine"]
+    assert (service.error is not None) is is_shared and service.counts["errors"] == 1
+
+
+def test_a_frame_that_was_dropped_meanwhile_is_requested_again(service, monkeypatch):
+    def fail(request, viewer):
+        raise FrameNotReadyError
+
+    log = []
+    session = Eager("a", log)
+    service.join(session)
+    monkeypatch.setattr(service.renderer, "render", fail)
+    assert service.serve_next() and log == ["a gave up"]
+    assert not session.failures and service.error is None and service.counts["errors"] == 0
 
 
 def test_a_cancelled_view_is_neither_delivered_nor_a_failure(service):

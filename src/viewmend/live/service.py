@@ -49,7 +49,7 @@ class RenderService:
         self.changed: Callable[[], None] = lambda: None
         """Called, on any thread, when the source has changed."""
         self.error: str | None = None
-        """The error of the last view, or of the rig's first frame."""
+        """The error of the last view, unless its request was at fault; or of the rig's first frame."""
         self.ahead = CompletedAhead(renderer)
         """Completed virtual cameras of the frames that pages draw."""
         self.counts = Counter(frames=0, shared=0, errors=0, cancelled=0)
@@ -169,11 +169,18 @@ class RenderService:
             self.counts["cancelled"] += 1
             session.give_up()
             return True
-        except Exception as error:  # reported to this session only
-            log.exception("while rendering a view")
-            self.error = f"{type(error).__name__}: {error}"[:400]
+        except FrameNotReadyError:  # the frame was dropped since `next_request`
+            session.give_up()
+            return True
+        except Exception as error:  # reported to its session
+            message = f"{type(error).__name__}: {error}"[:400]
             self.counts["errors"] += 1
-            session.fail(self.error)
+            session.fail(message)
+            if isinstance(error, ValueError):  # the request is at fault
+                log.debug("a view that cannot be rendered: %s", message)
+            else:
+                log.exception("while rendering a view")
+                self.error = message
             return True
         self.error = None
         self.counts.update(frames=1, shared=int(times.shares_geometry))
