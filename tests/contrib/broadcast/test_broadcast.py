@@ -210,6 +210,18 @@ def test_an_image_that_is_rendered_while_the_video_ends_is_dropped(ball_view):
     assert session.image is not None
 
 
+def test_the_view_that_was_shown_before_is_shown_again():
+    """Nothing has changed since the last watcher left, in a capture of one frame."""
+    session = BroadcastSession(idle_service(), SIZE, None)
+    session.open()
+    first = session.next_request(0.0, PLAYBACK)
+    assert session.next_request(0.0, PLAYBACK) is None
+    session.close()
+    session.open()
+    again = session.next_request(0.0, PLAYBACK)
+    assert first is not None and again is not None and again.time == first.time
+
+
 def test_a_failing_encoder_is_started_again(monkeypatch, caplog):
     add, failures = HlsSegmenter.add, []
 

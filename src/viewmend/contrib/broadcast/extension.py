@@ -64,7 +64,9 @@ class BroadcastSession(ViewerSession):
         """The newest image; None before the first."""
 
     def open(self) -> None:
-        """Accept images from now on."""
+        """Accept images from now on, beginning with one of the present look; called under the service's lock."""
+        if self.wanted_look is not None:
+            self.look(self.wanted_look)
         self._is_open = True
 
     def close(self) -> None:
@@ -226,7 +228,8 @@ class Broadcast(Extension):
 
     def _run(self) -> None:
         """Render and encode until the video is no longer watched."""
-        self.session.open()
+        with self._service.lock:
+            self.session.open()
         self._service.join(self.session)
         try:
             while self.is_watched and self.session.image is None:
