@@ -89,6 +89,7 @@ def metrics_text(registry: SessionRegistry) -> str:
     service = registry.service
     source = service.source
     counts = service.counts
+    available = source.span.end - source.span.first
     ready = int(service.is_ready and source.status.state == "ready")
     dropped = sum(session.dropped for session in list(registry.sessions))
     stages = {label(stage=stage): ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"}
@@ -109,7 +110,7 @@ def metrics_text(registry: SessionRegistry) -> str:
             "viewmend_cancelled_total", "counter", "Views that were not needed any more.", counts["cancelled"]
         ),
         *metric("viewmend_errors_total", "counter", "Views that failed.", counts["errors"]),
-        *metric("viewmend_source_frames", "gauge", "Frames that can be requested.", source.span.end),
+        *metric("viewmend_source_frames", "gauge", "Frames that can be requested.", available),
         *metric("viewmend_stage_seconds_total", "counter", "Seconds spent in each stage.", stages),
     ]
     for extension in registry.extensions:
