@@ -6,6 +6,7 @@ import pytest
 from live.live_servers import CAMERAS, wait_until
 from reference.ball import BallCapture
 
+from viewmend.data.prepare import PreparedCapture
 from viewmend.live import frame_source
 from viewmend.live.frame_source import Clock, FrameCache, RecordedSource, Span
 from viewmend.live.protocol import ClockChange
@@ -69,6 +70,17 @@ def test_generated_frames_can_be_requested_once_they_exist(reading):
     read(capture, 2)
     wait_until(lambda: source.span.complete)
     assert capture.order == [0, 1, 2, 3, 4] and source.status.state == "ready"
+
+
+def test_a_recording_has_all_cameras_that_its_frames_may_have():
+    prepared = PreparedCapture(BallCapture(CAMERAS), left_out=CAMERAS.names[2:3])
+    for capture, names in (
+        (prepared.source, CAMERAS.names),
+        (prepared, CAMERAS.names[:2] + CAMERAS.names[3:]),
+    ):
+        source = RecordedSource(lambda capture=capture: capture)
+        source._open()
+        assert source.rig is not None and source.rig.cameras.names == names
 
 
 def test_dropped_frames_are_read_again(reading):

@@ -67,6 +67,12 @@ class PreparedCapture(CaptureWrapper):
         x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)
         return limit_camera_size(self.source.cameras.moved(x_px, y_px), self.max_image_size)
 
+    @property
+    def usable_cameras(self) -> Cameras:
+        """Those of `cameras` that frames may have: the input cameras that are not left out."""
+        inputs = self.cameras.names if self.inputs is None else self.inputs
+        return self.cameras.select([name for name in inputs if name not in self.left_out])
+
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` with the calibration of `cameras`; see `adjust`.
 

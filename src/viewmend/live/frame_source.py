@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.data.prepare import PreparedCapture
 from viewmend.data.source import CaptureSource
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
 from viewmend.live.protocol import ClockChange
 from viewmend.types import MultiViewFrame
 from viewmend.utils.tensors import size_bytes, to_mmap
@@ -105,13 +107,15 @@ class Clock:
 
 @dataclass(frozen=True)
 class RigInfo:
-    """What a source knows about its rig besides the cameras."""
+    """What a source knows about its rig."""
 
     name: str
     bounds: Bounds | None
     up: Float[Tensor, "3"] | None
     number: int = 0
     """Distinguishes a rig from the one that was connected before."""
+    cameras: Cameras | None = None
+    """All cameras that frames may have; None if they are those of the first frame."""
 
 
 @dataclass(frozen=True)
@@ -276,7 +280,8 @@ class RecordedSource(FrameSource):
         total = len(capture.frame_ids)
         fps = (self._fps or capture.fps or 0.0) if total > 1 else 0.0
         self.span = Span(0, 0 if self._generated else total, total, fps)
-        self.rig = RigInfo(capture.name, capture.bounds, capture.up)
+        cameras = capture.usable_cameras if isinstance(capture, PreparedCapture) else capture.cameras
+        self.rig = RigInfo(capture.name, capture.bounds, capture.up, cameras=cameras)
         return capture
 
     def _step(self, capture: CaptureSource) -> None:

@@ -61,12 +61,19 @@ class LiveSource(FrameSource):
         with self._lock:
             return self._cache.get(index)
 
-    def begin(self, name: str, fps: float, bounds: Bounds | None, up: Float[Tensor, "3"] | None) -> None:
+    def begin(
+        self,
+        name: str,
+        fps: float,
+        bounds: Bounds | None,
+        up: Float[Tensor, "3"] | None,
+        cameras: Cameras | None = None,
+    ) -> None:
         """Start a rig; the frames of an earlier one can no longer be requested."""
         with self._lock:
             self.span = replace(self.span, first=self.span.end, fps=self._fps or fps)
             self.status = SourceStatus()
-            self.rig = RigInfo(name, bounds, up, 1 if self.rig is None else self.rig.number + 1)
+            self.rig = RigInfo(name, bounds, up, 1 if self.rig is None else self.rig.number + 1, cameras)
         self.changed()
 
     def add(self, frame: MultiViewFrame) -> int:
@@ -195,10 +202,12 @@ def _begin_rig(text: str, source: PushSource) -> Cameras:
     bounds = (
         None if rig.bounds is None else Bounds(torch.tensor(rig.bounds.low), torch.tensor(rig.bounds.high))
     )
-    source.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up))
     K, R, T = (torch.tensor([getattr(camera, key) for camera in rig.cameras]) for key in ("K", "R", "T"))
     size_px = torch.tensor([(camera.width, camera.height) for camera in rig.cameras])
-    return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
+    names = tuple(camera.name for camera in rig.cameras)
+    cameras = Cameras(names, K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
+    source.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up), cameras)
+    return cameras
 
 
 def _decode_frame(

@@ -183,7 +183,7 @@ class Renderer:
         proxy = cached.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
-        cameras = cached.frame.cameras
+        cameras = cached.frame.cameras if rig.cameras is None else rig.cameras
         home = home_view(cameras, center, rig.up)
         warm_up = view_camera(Camera(azimuth=home.azimuth), home, (WARM_UP_PX, WARM_UP_PX)).to(self._device)
         self._view(stream, warm_up, stream.viewer(), index, RenderQuality())

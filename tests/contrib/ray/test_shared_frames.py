@@ -222,6 +222,18 @@ def pushing(follow, **options):
     return pushed, frame, link, follow(link, **options)
 
 
+def test_the_cameras_that_a_rig_has_found_with_its_first_frame_are_followed(follow):
+    """A rig that reads its cameras knows their alignment only then."""
+    pushed = PushSource()
+    pushed.begin("one", 15.0, None, None)
+    source = follow(Link(ingest_of(pushed)))
+    assert source.rig.cameras is None
+    pushed.rig = replace(pushed.rig, cameras=CAMERAS)
+    pushed.add(BallCapture(CAMERAS, 1).read(0))
+    wait_until(lambda: source.span.end == 1)
+    assert source.rig.cameras is not None and source.rig.cameras.names == CAMERAS.names
+
+
 def test_a_new_rig_replaces_the_earlier_one(follow):
     pushed, frame, _, source = pushing(follow)
     assert fetch(source, 0) is not None and source.span.live

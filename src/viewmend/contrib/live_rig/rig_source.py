@@ -254,6 +254,7 @@ class RigFileSource(LiveSource):
         )
         for change in prepared.changes:
             log.warning("%s", change)
+        self.rig = replace(self.rig, cameras=prepared.usable_cameras)
         return prepared
 
     def _add_image(self, worker: CameraWorker, taken_s: float, images: CameraImages) -> None:

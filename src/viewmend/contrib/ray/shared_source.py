@@ -115,9 +115,10 @@ class SharedSource(FrameSource):
 
     def _apply(self, state: SourceState) -> None:
         with self._lock:
+            if state.source != self._source_id or self.span.end <= self.span.first:
+                self.rig = state.rig  # complete once there is a frame
             if state.source != self._source_id:
                 self._source_id = state.source
-                self.rig = state.rig
                 self._kept.clear()
                 self._wanted = {}
                 self._ahead = None
