@@ -12,6 +12,7 @@ import pytest
 import torch
 from live.live_servers import (
     CAMERAS,
+    PIPELINE,
     WAIT_S,
     close_code,
     get,
@@ -26,9 +27,17 @@ from websockets.exceptions import ConnectionClosed
 from viewmend.geometry.bounds import Bounds
 from viewmend.live import push
 from viewmend.live.client import Client, Publisher
-from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import ProtocolError, pack
+from viewmend.live.poses import cameras_json, home_view
+from viewmend.live.protocol import Limits, ProtocolError, pack
 from viewmend.live.push import PushSource
+from viewmend.live.registry import SessionRegistry
+from viewmend.live.render_jobs import PathJob, RenderError, parse_path
+from viewmend.live.renderer import Renderer
+from viewmend.live.responses import metrics_text
+from viewmend.live.service import RenderService
+from viewmend.live.sessions import PlaybackState
+from viewmend.models.smooth_fill import SmoothFill
+from viewmend.stream import Stream
 
 BOUNDS = Bounds(torch.full((3,), -0.6), torch.full((3,), 0.6))
 UP = torch.tensor([0.0, 1.0, 0.0])
@@ -198,6 +207,70 @@ def test_memory_of_a_live_rig_is_bounded():
         source.add(photograph(CAMERAS))
     assert source.span.end == 20 and 15 <= source.span.first < 20
     assert source.read(source.span.first) is not None and source.read(source.span.first - 1) is None
+
+
+def test_the_metrics_count_the_frames_that_can_be_requested():
+    source = PushSource(memory_mb=0.3)
+    source.begin("x", 10.0, None, None)
+    for _ in range(20):
+        source.add(photograph(CAMERAS))
+    service = RenderService(Renderer(source, SmoothFill()), source)
+    text = metrics_text(SessionRegistry(service, Limits(), None, {}))
+    assert f"viewmend_source_frames {20 - source.span.first}\n" in text
+
+
+def test_a_rig_has_the_cameras_of_its_message():
+    """Its first frame may lack some of them."""
+    source = PushSource()
+    cameras = push._begin_rig(rig_message(), source)
+    assert source.rig is not None and source.rig.cameras is cameras
+
+
+POSES = json.dumps({"poses": [{"azimuth": 20.0}] * 3, "width": 32, "height": 32})
+
+
+def path_of(source, **changes):
+    """A path job, and a function that returns its next request."""
+    job = PathJob(parse_path(json.dumps(json.loads(POSES) | changes).encode(), Limits()))
+    home = home_view(CAMERAS, torch.zeros(3), UP)
+    return job, lambda: job.next_request(0.0, PlaybackState(source.span, source.edge, home, source.read, 1))
+
+
+def test_the_frozen_edge_of_a_live_rig_stays_until_its_video_is_finished():
+    source = PushSource(memory_mb=0.1)
+    source.begin("x", 10.0, BOUNDS, UP)
+    source.add(photograph(CAMERAS))
+    renderer = Renderer(source, SmoothFill(), PIPELINE)
+    assert renderer.prepare(0)
+    job, next_request = path_of(source)
+    views = []
+    for _ in range(2):
+        request = next_request()
+        assert request is not None and request.time == 0
+        result = renderer.render(request, None)
+        job.encode(result)
+        views.append(result.completed[0].rgb)
+        for _ in range(9):
+            source.add(replace(photograph(CAMERAS), rgb=photograph(CAMERAS).rgb // 2))
+        renderer._stream = Stream(SmoothFill(), PIPELINE, BOUNDS)  # has dropped the frame, too
+    assert source.read(0) is None and torch.equal(*views)
+
+
+def test_a_video_of_frames_that_a_live_rig_has_dropped_is_an_error():
+    source = PushSource(memory_mb=0.1)
+    source.begin("x", 10.0, BOUNDS, UP)
+    source.add(photograph(CAMERAS))
+    job, next_request = path_of(source, times=[0, 1, 99])
+    request = next_request()
+    assert request is not None and request.time == 0
+    job._count = 1
+    for _ in range(9):
+        source.add(photograph(CAMERAS))
+    with pytest.raises(RenderError, match="frame 1 is no longer in memory"):
+        next_request()
+    job._count = 2
+    request = next_request()
+    assert request is not None and request.time == source.span.newest, "the nearest frame"
 
 
 def test_the_size_of_an_image_is_checked_before_decoding(monkeypatch):

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 from live.live_servers import FakeClock
-from reference.ball import ring
+from reference.ball import photograph, ring
 
 from viewmend.live import sessions
 from viewmend.live.budget import CONTEXT_LADDER, FULL, MAX_WAIT_S, REFINE_LADDER, ResolutionLimit
@@ -19,6 +19,7 @@ from viewmend.utils.timing import StageTimes
 
 HOME = home_view(ring(4), torch.zeros(3), None)
 SPAN = Span(0, 20, 20, 10.0)
+FRAME = photograph(ring(2))
 
 
 class Desk:
@@ -41,8 +42,11 @@ class Desk:
         """The request some seconds later."""
         self.clock.advance(after)
         self.edge = self.edge if edge is None else edge
-        playback = PlaybackState(self.span, self.edge, HOME, self.has_frame, self.active_viewers, self.limit)
+        playback = PlaybackState(self.span, self.edge, HOME, self.read, self.active_viewers, self.limit)
         return self.session.next_request(self.clock(), playback)
+
+    def read(self, index):
+        return FRAME if self.has_frame(index) else None
 
     def size(self, request):
         return tuple(request.cameras[0].size_px[0].tolist())

@@ -197,14 +197,17 @@ class ImageJob(RenderJob[tuple[bytes, RenderResult]]):
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The view; None while its frame is being read."""
-        if self.done.done():
+        if self.done.done() or playback.span.end <= playback.span.first:
             return None
         asked = self._asked
+        index = int(playback.span.clamp(playback.edge if asked.time == "live" else asked.time))
+        if playback.read(index) is None:
+            return None
         pose = Camera(
             azimuth=asked.azimuth, elevation=asked.elevation, distance=asked.distance, fov_y=asked.fov_y
         )
-        request = request_view(asked, pose, playback.edge if asked.time == "live" else asked.time, playback)
-        return None if request is None else replace(request, without=asked.left_out, truth=asked.camera)
+        request = request_view(asked, pose, index, playback.home)
+        return replace(request, without=asked.left_out, truth=asked.camera)
 
     def encode(self, result: RenderResult) -> None:
         """Encode the image."""
@@ -218,6 +221,8 @@ class PathJob(RenderJob[bytes]):
         super().__init__()
         self._path = path
         self._times = path.times
+        self._frame: MultiViewFrame | None = None
+        """The frame of the last view, which is kept because a live rig may drop it before the next view."""
         self._count = 0
         self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps, threads=1)  # encodes on the render thread
@@ -228,15 +233,23 @@ class PathJob(RenderJob[bytes]):
         return self._count, len(self._path.poses)
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
-        """The view of the next pose; None while its frame is being read."""
+        """The view of the next pose; None while its frame is being read. RenderError if a live rig has dropped it."""
         if self.done.done() or playback.span.end <= playback.span.first:
             return None
         if self._times is None:  # the edge at the start of the job
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
-        pose = self._path.poses[self._count]
-        index = self._times[self._count]
-        request = request_view(self._path, pose, index, playback, self._path.stereo_m)
-        return None if request is None else replace(request, without=self._path.without)
+        index = min(self._times[self._count], playback.span.newest)
+        if self._frame is None or self._frame.time != index:
+            if index < playback.span.first:
+                raise RenderError(
+                    f"frame {index} is no longer in memory; export fewer, or use more --memory-mb"
+                )
+            self._frame = playback.read(index)
+        if self._frame is None:
+            return None
+        path = self._path
+        request = request_view(path, path.poses[self._count], index, playback.home, path.stereo_m)
+        return replace(request, without=path.without, frame=self._frame)
 
     def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
@@ -251,16 +264,13 @@ class PathJob(RenderJob[bytes]):
 def request_view(
     asked: ViewOptions,
     pose: Camera,
-    index: float | int,
-    playback: PlaybackState,
+    index: int,
+    home: HomeView,
     stereo_m: float | None = None,
-) -> RenderRequest | None:
-    """The request for a view of the frame closest to `index`; None while that frame is being read."""
-    index = int(playback.span.clamp(index))
-    if playback.span.end <= playback.span.first or not playback.has_frame(index):
-        return None
-    camera = view_camera(pose, playback.home, (asked.width, asked.height))
-    eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.home.center)
+) -> RenderRequest:
+    """The request for a view of the frame `index`."""
+    camera = view_camera(pose, home, (asked.width, asked.height))
+    eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, home.center)
     quality = RenderQuality(mend=asked.mode in protocol.COMPLETED_MODES | {"error"}, top_k=asked.top_k)
     return RenderRequest(
         index, eyes, quality, asked.error_rule, protocol.EXTRA_MODES & {asked.mode}, model=asked.model

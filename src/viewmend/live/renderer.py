@@ -61,6 +61,8 @@ class RenderRequest:
     """The shipped model whose view is the mode "compared". If given, "error" and the score are of this view."""
     truth: str | None = None
     """A rig camera that replaces `cameras`; the view is scored against its image."""
+    frame: MultiViewFrame | None = None
+    """The frame, if the source may have dropped it meanwhile; None to read it."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ class Renderer:
             raise FrameNotReadyError
         without = self.left_out(request.without)
         stream = self._stream_of(None, without)
-        cached = self._add_frame(stream, request.time, without)
+        cached = self._add_frame(stream, request.time, without, request.frame)
         before = stream.viewer() if viewer is None else viewer
         truth = None if request.truth is None else self._true_frame(request.time, request.truth)
         if request.error_rule is not None:
@@ -424,13 +426,14 @@ class Renderer:
             raise FrameNotReadyError
         return frame.to(self._device)
 
-    def _add_frame(self, stream: Stream, index: int, without: tuple[str, ...] = ()) -> CachedFrame:
+    def _add_frame(
+        self, stream: Stream, index: int, without: tuple[str, ...] = (), frame: MultiViewFrame | None = None
+    ) -> CachedFrame:
         """Add a frame to the stream, with everything that another process has computed for it."""
-        if without:
-            return stream.add_frame(self._read(index).without(without))
-        shared = self._source.read_cached(index)
+        shared = None if without else self._source.read_cached(index)
         if shared is None:
-            return stream.add_frame(self._read(index))
+            read = self._read(index) if frame is None else frame.to(self._device)
+            return stream.add_frame(read.without(without) if without else read)
         assert isinstance(shared.proxy, GeometryProxy), "shared frames have hulls"
         if self._device == "cpu":
             return stream.adopt(shared)

@@ -235,7 +235,7 @@ class RenderService:
             span,
             self.advance_edge(),
             home,
-            has_frame=lambda index: self.source.read(index) is not None,
+            self.source.read,
             active_viewers=max(1, sum(viewer.is_active(now) for viewer in viewers)),
             resolution_limit=self._resolution_limit,
             has_other_viewers=len(viewers) > 1,

@@ -18,6 +18,7 @@ from viewmend.live.protocol import COMPLETED_MODES, EXTRA_MODES, ClockChange, Fr
 from viewmend.live.quality import Ladder, QualityLevel
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
+from viewmend.types import MultiViewFrame
 
 STILL_S = 0.25
 """A view that has been still for this many seconds is rendered again at the level `Ladder.still`."""
@@ -35,8 +36,8 @@ class PlaybackState:
     edge: float
     """Playback position, in frames, of all viewers that follow the edge."""
     home: HomeView
-    has_frame: Callable[[int], bool]
-    """Returns whether a frame is in memory, and requests it from the source if it is not."""
+    read: Callable[[int], MultiViewFrame | None]
+    """Returns a frame; None if it is not in memory, in which case it is requested from the source."""
     active_viewers: int
     """The number of viewers that were sent a frame within the last second or wait for one; at least 1."""
     resolution_limit: ResolutionLimit = field(default_factory=ResolutionLimit)
@@ -292,7 +293,7 @@ class ViewerSession:
         is_behind = self.clock.playing and playback.span.first <= awaited.index < due
         keeps_waiting = is_behind and now - awaited.since_s < MAX_AWAITED_S
         index = awaited.index if keeps_waiting else due
-        if playback.has_frame(index):
+        if playback.read(index) is not None:
             self._awaited = AwaitedFrame(-1, now)
             return index
         if index != awaited.index:
