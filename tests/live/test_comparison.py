@@ -1,6 +1,7 @@
 """Views by another model or without some cameras, and their scores, are those of a renderer that has nothing else."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -83,6 +84,25 @@ def test_scores_are_those_of_mend(views, model):
     assert result.psnr_db == pytest.approx(step.scores.ours.psnr_subject, abs=0.01)
     errors = result.extra[0]["error"][0]
     assert errors.shape == truth.rgb.shape[2:] and 0.05 < errors.max() <= 1
+
+
+def test_a_camera_that_the_first_frame_lacks_can_be_left_out():
+    source = Ball((LEFT_OUT,))
+    source.rig = replace(source.rig, cameras=CAMERAS)
+    renderer = Renderer(source, SmoothFill(), PIPELINE)
+    assert renderer.prepare(0) and renderer.rig_json is not None
+    assert [camera["name"] for camera in renderer.rig_json["cameras"]] == list(CAMERAS.names)
+    assert renderer.left_out((LEFT_OUT,)) == (LEFT_OUT,)
+
+
+def test_a_name_with_commas_may_come_in_parts():
+    renderer = Renderer(Ball(), SmoothFill())
+    renderer.rig_json = {"cameras": [{"name": name} for name in ("left,top", "left", "a", "b", "c")]}
+    assert (
+        renderer.left_out(("left,top",)) == renderer.left_out(("b", "top", "left,top"))[:1] == ("left,top",)
+    )
+    assert renderer.left_out(["left", "top", "b"]) == ("left,top", "left", "b")
+    assert renderer.left_out(("left", "b")) == ("left", "b")
 
 
 def test_few_variants_are_kept(views):

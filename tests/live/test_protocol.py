@@ -6,6 +6,7 @@ import struct
 import pytest
 
 from viewmend.live import protocol
+from viewmend.live.assets import AssetQuery
 from viewmend.live.protocol import (
     Ack,
     Camera,
@@ -17,6 +18,7 @@ from viewmend.live.protocol import (
     Look,
     ProtocolError,
 )
+from viewmend.live.render_jobs import ImageQuery, SourceImageQuery
 
 LIMITS = Limits()
 
@@ -129,6 +131,18 @@ def test_stage_times_are_added_and_averaged():
     assert times.as_json(2) == {
         "geometry": 0, "context": 0, "rendering": 4, "inpainting": 0, "encode": 1, "wait": 0.5, "total": 5.5
     }  # fmt: skip
+
+
+def test_cameras_may_have_long_names():
+    """As those of calibrations whose names are paths."""
+    name = 300 * "c"
+    assert said(type="look", without=[name]).without == (name,)
+    for kind, query in (
+        (ImageQuery, {"camera": name, "without": ",".join(30 * [name])}),
+        (SourceImageQuery, {"name": name}),
+        (AssetQuery, {"time": "0", "without": ",".join(30 * [name])}),
+    ):
+        assert protocol.read_message(query, kind, strict=False)
 
 
 def test_null_means_absent():

@@ -21,12 +21,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import GeometryProxy
@@ -87,8 +87,8 @@ class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     depth; None for the shape."""
     v: protocol.ShortText = ""
     """The version in the message `rig`, with which the response never changes."""
-    without: Annotated[str, Meta(max_length=4096)] = ""
-    """Names of cameras that are not used, separated by commas."""
+    without: protocol.NameList = ""
+    """Cameras that are not used."""
     token: str = ""
 
 

@@ -60,7 +60,10 @@ Colour = Annotated[str, Meta(pattern="^[0-9a-f]{6}\\Z")]
 BLACK = "000000"
 WHITE = "ffffff"
 ShortText = Annotated[str, Meta(max_length=40)]
-Names = Annotated[tuple[ShortText, ...], Meta(max_length=128)]
+CameraName = Annotated[str, Meta(max_length=4000)]
+Names = Annotated[tuple[CameraName, ...], Meta(max_length=128)]
+NameList = Annotated[str, Meta(max_length=16_384)]
+"""Names of cameras, separated by commas."""
 
 
 class CloseCode(IntEnum):

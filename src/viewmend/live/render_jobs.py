@@ -34,8 +34,6 @@ TURNTABLE_VIEWS = 25
 SOURCE_QUALITY = 90
 """JPEG quality of the cameras' own images."""
 Result = TypeVar("Result")
-NameList = Annotated[str, Meta(max_length=4096)]
-"""Names of cameras, separated by commas."""
 
 
 class ViewOptions(Struct, frozen=True, kw_only=True):
@@ -60,10 +58,10 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
     fov_y: protocol.FieldOfView | None = None
     quality: protocol.Quality = 85
     time: Literal["live"] | protocol.Count = "live"
-    camera: protocol.ShortText | None = None
+    camera: protocol.CameraName | None = None
     """A camera of the rig: the view has its pose, lens and size, and is scored against its image."""
     mode: Annotated[str, one_of(*protocol.MODES, "error")] = "completed"
-    without: NameList = ""
+    without: protocol.NameList = ""
     token: str = ""
 
     def __post_init__(self) -> None:
@@ -81,7 +79,7 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
 class SourceImageQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The query of `GET /camera.jpg`."""
 
-    name: protocol.ShortText
+    name: protocol.CameraName
     """The camera's name."""
     time: Literal["live"] | protocol.Count = "live"
     token: str = ""

@@ -270,13 +270,18 @@ class Renderer:
         return self._inpainter.source_names(rendered) if is_predicted else rendered.source_views
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The rig's cameras with these names, in its order; ValueError if fewer than two others are left."""
+        """The rig's cameras with these names, in its order; ValueError if fewer than two others are left.
+
+        A camera's name that has commas may be divided at them.
+        """
         own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
-        if names and len(set(own) - set(names)) < 2:
+        listed = f",{','.join(names)},"
+        found = tuple(name for name in own if name in names or ("," in name and f",{name}," in listed))
+        if names and len(own) - len(found) < 2:
             raise ValueError(
-                f"expected two input cameras or more, got {len(set(own) - set(names))}; leave out fewer"
+                f"expected two input cameras or more, got {len(own) - len(found)}; leave out fewer"
             )
-        return tuple(name for name in own if name in names)
+        return found
 
     def make_assets(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> FrameAssets:
         """What a page needs to draw views of a frame without some of its cameras; callable from any thread.
