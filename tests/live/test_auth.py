@@ -107,9 +107,8 @@ def test_a_public_address_is_one(url):
 
 
 def test_an_origin_has_the_default_port_of_its_scheme():
-    access = AccessControl("0.0.0.0", "x" * 16)
-
-    def is_refused(host, origin):
+    def is_refused(host, origin, public_url=None):
+        access = AccessControl("0.0.0.0", "x" * 16, public_url)
         headers = [(b"host", host.encode()), (b"origin", origin.encode())]
         return access.find_foreign_origin(HTTPConnection({"type": "http", "headers": headers})) is not None
 
@@ -119,6 +118,8 @@ def test_an_origin_has_the_default_port_of_its_scheme():
         "rig.example", "file://rig.example"
     )
     assert is_refused("rig.example:80", "https://rig.example")
+    assert not is_refused("127.0.0.1:8008", "https://rig.example", "https://rig.example:443/mend")
+    assert is_refused("127.0.0.1:8008", "https://rig.example", "http://rig.example:443")
 
 
 def test_an_address_of_other_machines_needs_a_token():

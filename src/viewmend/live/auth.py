@@ -12,6 +12,10 @@ from starlette.requests import HTTPConnection
 MIN_TOKEN_LENGTH = 16
 WRONG_TOKEN_S = 0.5
 """Delay before a wrong token is answered."""
+DEFAULT_PORTS = {"http": 80, "https": 443}
+"""Ports that addresses of these schemes may leave out."""
+Origin = tuple[str, str, int]
+"""Scheme, name and port of a site, in lower case."""
 
 
 def is_loopback(host: str) -> bool:
@@ -46,20 +50,15 @@ class AccessControl:
                 f"expected --token with --public-url {public_url}, which other machines can reach; create a "
                 "long random one"
             )
-        self._public: str | None = None
+        self._public: Origin | None = None
         if public_url is not None:
             url = urlsplit(public_url)
-            if (
-                url.scheme not in ("http", "https")
-                or not _parse_host(url.netloc, 80)
-                or url.query
-                or url.fragment
-            ):
+            self._public = _parse_origin(f"{url.scheme}://{url.netloc}")
+            if self._public is None or url.query or url.fragment:
                 next_step = "write the proxy's address"
                 raise ValueError(
                     f"expected --public-url https://NAME/PATH, got '{public_url[:80]}'; {next_step}"
                 )
-            self._public = f"{url.scheme}://{url.netloc}".lower()
         # Without a token, a page whose name resolves to this machine could read what it shows.
         self._any_host = bool(token) or not is_loopback(host)
         self._token = token
@@ -77,7 +76,7 @@ class AccessControl:
             next_step = "open the address that was printed, or add --token"
             return f"expected a request to localhost, got one to '{host[:60]}'; {next_step}"
         origin = connection.headers.get("origin")
-        if origin is not None and not (_is_same_origin(origin, host) or origin.lower() == self._public):
+        if origin is not None and not _is_own_origin(origin, host, self._public):
             next_step = "open the printed address, or start the server with --public-url"
             return (
                 f"expected a request from this server's own page, got the origin '{origin[:60]}'; {next_step}"
@@ -107,10 +106,17 @@ def _parse_host(host: str, default_port: int) -> tuple[str, int] | None:
     return found and (found[1] or found[2], int(found[3] or default_port))
 
 
-def _is_same_origin(origin: str, host: str) -> bool:
-    scheme, _, address = origin.partition("://")
-    port = {"http": 80, "https": 443}.get(scheme.lower())
-    return port is not None and None is not _parse_host(host, port) == _parse_host(address, port)
+def _parse_origin(origin: str) -> Origin | None:
+    """The parts of an `Origin` header; None for a malformed one, or another scheme."""
+    scheme, _, address = origin.lower().partition("://")
+    host = _parse_host(address, DEFAULT_PORTS[scheme]) if scheme in DEFAULT_PORTS else None
+    return host and (scheme, *host)
+
+
+def _is_own_origin(origin: str, host: str, public: Origin | None) -> bool:
+    """Whether an `Origin` header names the server: the request's own `Host`, or the public address."""
+    parsed = _parse_origin(origin)
+    return parsed is not None and parsed in (public, _parse_origin(f"{parsed[0]}://{host}"))
 
 
 class RateLimit:
