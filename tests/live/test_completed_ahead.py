@@ -24,7 +24,7 @@ from reference.ball import BallCapture
 from reference.other_device import other_device
 
 from viewmend.live.assets import Asset, CompletedImage
-from viewmend.live.completed_ahead import RETRY_S, CompletedAhead
+from viewmend.live.completed_ahead import MAX_DRAWN, RETRY_S, CompletedAhead
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.poses import home_view
 from viewmend.live.renderer import Renderer
@@ -151,6 +151,26 @@ def test_a_failure_ends_the_views_of_its_frame(ahead, caplog):
         ahead.make(task)
     ahead.note_failure(task, failure.value)
     assert ahead.choose([shown(13)]) is None and "bad luck" in caplog.text
+
+
+def test_failures_are_logged_once_and_tried_rarely_and_old_ones_forgotten(ahead, caplog, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("bad luck")
+
+    monkeypatch.setattr(ahead._renderer, "complete_virtual_camera", fail)
+    now = slow_down(ahead, "complete_virtual_camera", monkeypatch)
+    tried_s = []
+    for time in range(2 * MAX_DRAWN):
+        now[0] += 1.0
+        ahead.note_drawn((time, ()))
+        task = ahead.choose([shown(time, interval_s=10.0)])
+        if task is not None:
+            tried_s.append(now[0])
+            with pytest.raises(RuntimeError) as failure:
+                ahead.make(task)
+            ahead.note_failure(task, failure.value)
+    assert len(tried_s) > 2 and min(np.diff(tried_s)) > RETRY_S and caplog.text.count("bad luck") == 1
+    assert len(ahead._drawn) == MAX_DRAWN, "also of those that failed"
 
 
 def test_playing_frames_are_completed_only_if_a_view_takes_less_than_a_frame(ahead, monkeypatch):

@@ -1,6 +1,7 @@
 """Fused meshes and completed views of the frames that pages draw, made while no viewer waits for a view."""
 
 import logging
+import math
 import threading
 import time
 from collections import OrderedDict
@@ -17,7 +18,7 @@ from viewmend.live.sessions import ShownFrame
 from viewmend.utils.cancellation import CancelledError
 
 RETRY_S = 10.0
-"""If a mesh or view took longer than a playing frame is shown, the next is tried after this many seconds."""
+"""If a mesh or view failed, or took longer than a frame is shown, the next is tried after this many seconds."""
 MAX_DRAWN = 64
 """This many frames that pages draw are remembered."""
 
@@ -72,15 +73,17 @@ class CompletedAhead:
         self._lock = threading.Lock()
         self._version: str | None = None
         """`Renderer.assets_version` of the rig to which all of this belongs."""
-        self._drawn: OrderedDict[FrameKey, None] = OrderedDict()
-        """Frames that pages draw, in the order in which they were last requested."""
+        self._drawn: OrderedDict[FrameKey, bool] = OrderedDict()
+        """Frames that pages draw, in the order in which they were last requested, each with whether a mesh or a
+        view of it failed."""
         self._made: OrderedDict[FrameKey, MadeAhead] = OrderedDict()
         """What was made for each frame, in the order in which frames were last added to."""
         self._size_bytes = 0
-        self._failed: set[FrameKey] = set()
-        """Frames of which a mesh or a view failed."""
+        self._logged = ""
+        """The error that was logged last."""
         self._took_s = {"mesh": 0.0, "view": 0.0}
-        """Seconds that the last mesh and the last view took; a cancelled one counts only if it took longer."""
+        """Seconds that the last mesh and the last view took, infinite if it failed; a cancelled one counts only
+        if it took longer."""
         self._begun_s = -RETRY_S
         """When the last mesh or view was begun."""
         self.num_made = 0
@@ -90,7 +93,7 @@ class CompletedAhead:
         """Note that a page draws a frame, because it has requested the frame's assets."""
         with self._lock:
             self._forget_other_rigs()
-            self._drawn[key] = None
+            self._drawn.setdefault(key, False)
             self._drawn.move_to_end(key)
             while len(self._drawn) > MAX_DRAWN:
                 self._drawn.popitem(last=False)
@@ -130,7 +133,7 @@ class CompletedAhead:
         with self._lock:
             self._forget_other_rigs()
             for frame in shown:
-                if frame.key not in self._drawn or frame.key in self._failed:
+                if self._drawn.get(frame.key) is not False:  # not drawn, or failed
                     continue
                 made = self._made.get(frame.key, MadeAhead())
                 lacks_mesh = self._renderer.makes_meshes_ahead and made.mesh is None
@@ -169,10 +172,14 @@ class CompletedAhead:
                 self._keep(task, made)
 
     def note_failure(self, task: AheadTask, error: Exception) -> None:
-        """Log an error, and make nothing more for the task's frame."""
-        log.warning("while making the %s of frame %d: %s", task.kind, task.frame, error)
+        """Log an error that is not the last one again, and make nothing more for the task's frame."""
+        if str(error) != self._logged:
+            self._logged = str(error)
+            log.warning("while making the %s of frame %d: %s", task.kind, task.frame, error)
+        self._took_s[task.kind] = math.inf
         with self._lock:
-            self._failed.add(task.key)
+            if task.key in self._drawn:
+                self._drawn[task.key] = True
 
     def _keep(self, task: AheadTask, new: Asset | CompletedImage) -> None:
         """Add a mesh or a view, and drop the frames that were added to least recently if memory is full."""
@@ -197,7 +204,6 @@ class CompletedAhead:
             self._version = version
             self._drawn.clear()
             self._made.clear()
-            self._failed.clear()
             self._size_bytes = 0
 
 
