@@ -58,9 +58,9 @@ def test_a_rig_is_read(folder):
     """
     rig = read(folder, text)
     right, left = rig.cameras
-    assert (rig.name, rig.fps, rig.wait_s, rig.up.tolist()) == (folder.name, 30, 0.1, [0, -1, 0])
+    assert (rig.name, rig.fps, rig.up.tolist()) == (folder.name, 30, [0, -1, 0])
     assert rig.tolerance_s == pytest.approx(1 / 60)
-    assert (right.name, right.url, right.format, right.offset_s) == ("right", "/dev/video2", "v4l2", -0.02)
+    assert (right.name, right.url, right.format) == ("right", "/dev/video2", "v4l2")
     assert (left.url, left.format, left.clock, left.is_file) == (
         "rtsp://10.0.0.7/stream",
         None,
@@ -68,6 +68,17 @@ def test_a_rig_is_read(folder):
         False,
     )
     assert not left.calibration.dist[1:].any() and left.calibration.dist[0] == 0.1
+
+
+@pytest.mark.parametrize("offsets_ms", [(-400, 0), (0, 400), (100, 500)])
+def test_only_differences_of_offsets_count(folder, offsets_ms):
+    """Neither camera's images are in the future, and a frame waits for the later one's."""
+    text = 'calibration = "take"\n'
+    for name, offset_ms in zip(NAMES, offsets_ms, strict=True):
+        text += f'[[cameras]]\nname = "{name}"\nurl = "{name}.mp4"\noffset_ms = {offset_ms}\n'
+    rig = read(folder, text)
+    assert [camera.offset_s for camera in rig.cameras] == pytest.approx([0, 0.4])
+    assert rig.wait_s == pytest.approx(0.2 + 0.4)
 
 
 def test_files_lie_beside_the_rig_and_pictures_are_made_smaller(folder):

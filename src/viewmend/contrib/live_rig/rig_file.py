@@ -97,7 +97,7 @@ class LiveCamera:
     clock: str
     """Where the times of images come from: auto, sender or arrival."""
     offset_s: float
-    """The camera's delay, which is subtracted from the times of its images."""
+    """The camera's delay relative to the fastest camera, which is subtracted from the times of its images."""
     mask: MaskEntry
     plate: Path
     """The clean plate, for the mask method `plate`."""
@@ -123,7 +123,7 @@ class LiveRig:
     tolerance_s: float
     """Largest difference between the time of an image and the time of the frame that uses it."""
     wait_s: float
-    """How long a frame waits for late images."""
+    """How long a frame waits for late images, after the first one; the largest delay is included."""
     up: Float64[np.ndarray, "3"] | None
     """The up axis of the world; None if the calibration has none."""
     bounds_m: Float64[np.ndarray, "2 3"] | None
@@ -161,16 +161,18 @@ def read_rig(path: Path, max_image_size: int | None = None, fps: float | None = 
     if unknown:
         expected = f"expected cameras that {calibration.file} has ({', '.join(known)})"
         raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
+    cameras = [_camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras]
+    # Only differences count: no image is taken to be from the future
+    least_s = min(camera.offset_s for camera in cameras)
+    cameras = [replace(camera, offset_s=camera.offset_s - least_s) for camera in cameras]
     rate = fps or rig.fps
     half_interval_s = 0.5 / rate
     return LiveRig(
         name=rig.name or folder.name,
-        cameras=tuple(
-            _camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras
-        ),
+        cameras=tuple(cameras),
         fps=rate,
         tolerance_s=half_interval_s if rig.tolerance_ms is None else rig.tolerance_ms / 1000,
-        wait_s=rig.wait_ms / 1000,
+        wait_s=rig.wait_ms / 1000 + max(camera.offset_s for camera in cameras),
         up=calibration.up,
         bounds_m=calibration.bounds_m,
     )
