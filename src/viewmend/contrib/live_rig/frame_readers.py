@@ -30,9 +30,11 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 OPEN_S = 5.0
-"""An address that does not answer within this many seconds is tried again."""
+"""An address that does not answer within this many seconds is tried again, unless `SILENT_TICKS` are longer."""
 SILENT_S = 1.0
-"""A stream that sends nothing for this many seconds is opened again."""
+"""A stream that sends nothing for this many seconds is opened again, unless `SILENT_TICKS` are longer."""
+SILENT_TICKS = 2.5
+"""A stream that sends one image per tick is never silent for this many ticks."""
 LATE_S = 0.1
 """Images of a recording that are overdue by this many seconds are skipped."""
 MIN_WAIT_S = 0.002
@@ -122,7 +124,11 @@ class Playback:
 
 
 def read_images(
-    camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]
+    camera: LiveCamera,
+    counts: "Counter[str]",
+    playback: Playback,
+    wait: Callable[[float], bool],
+    interval_s: float = 0.0,
 ) -> Generator[DecodedImage, None, None]:
     """Generate the images of a camera from now on, until it fails. The caller closes the generator.
 
@@ -131,18 +137,23 @@ def read_images(
         counts: counts a stream's damaged images as "torn", and repeated ones as "duplicated".
         playback: the timeline of recordings.
         wait: waits for some seconds before a recording's next image; returns True to end the recording.
+        interval_s: the rig's time between two ticks.
 
     Raises:
         OSError: the camera cannot be opened; or it is a stream that ends or is silent.
     """
-    return _play_recording(camera, playback, wait) if camera.is_file else _receive_stream(camera, counts)
+    if camera.is_file:
+        return _play_recording(camera, playback, wait)
+    return _receive_stream(camera, counts, max(SILENT_S, SILENT_TICKS * interval_s))
 
 
-def _receive_stream(camera: LiveCamera, counts: "Counter[str]") -> Generator[DecodedImage, None, None]:
+def _receive_stream(
+    camera: LiveCamera, counts: "Counter[str]", silent_s: float
+) -> Generator[DecodedImage, None, None]:
     """A stream's undamaged images as they arrive."""
     import av
 
-    with closing(_open_stream(camera)) as container:
+    with closing(_open_stream(camera, silent_s)) as container:
         stream = container.streams.video[0]
         stream.codec_context.thread_count = 1
         times = frame_times(camera, container)
@@ -219,8 +230,8 @@ def _play_laps(
             return False
 
 
-def _open_stream(camera: LiveCamera) -> "InputContainer":
-    """Open the camera's address.
+def _open_stream(camera: LiveCamera, silent_s: float) -> "InputContainer":
+    """Open the camera's address, for a stream that is never silent for this many seconds.
 
     Raises:
         OSError: it does not answer, or has no video.
@@ -230,7 +241,8 @@ def _open_stream(camera: LiveCamera) -> "InputContainer":
     scheme = camera.url.partition("://")[0]
     options = FFMPEG_OPTIONS | SCHEME_OPTIONS.get(scheme, {}) | dict(camera.options)
     try:
-        container = av.open(camera.url, format=camera.format, options=options, timeout=(OPEN_S, SILENT_S))
+        timeout = (max(OPEN_S, silent_s), silent_s)
+        container = av.open(camera.url, format=camera.format, options=options, timeout=timeout)
     except (av.FFmpegError, ValueError) as error:
         raise OSError(_describe(error)) from None
     if not container.streams.video:

@@ -169,7 +169,7 @@ class RigFileSource(LiveSource):
 
     def _make_worker(self, camera: LiveCamera) -> CameraWorker:
         def connect(worker: CameraWorker) -> Generator[DecodedImage, None, None]:
-            return read_images(camera, worker.counts, self._playback, worker.wait)
+            return read_images(camera, worker.counts, self._playback, worker.wait, 1 / self._rig.fps)
 
         def wants(taken_s: float, period_s: float) -> bool:
             # A changed rig gets a new aligner, so the attribute is read at each call
