@@ -233,8 +233,15 @@ class RigFileSource(LiveSource):
         if self._prepared is None:
             self.status = replace(self.status, error="fewer than two masks show a subject")
             return
+        adjusted = self._prepared.adjust(frame, label="the newest frame")
+        if len(adjusted.cameras) < 2:
+            got = len(adjusted.cameras)
+            self._set_error(
+                f"expected at least two usable cameras, got {got}; the log names the others' faults"
+            )
+            return
         self.spread_ms = 1000 * group.spread_s
-        self.add(self._prepared.adjust(frame, label="the newest frame"))
+        self.add(adjusted)
 
     def _prepare(self, frame: MultiViewFrame) -> PreparedCapture | None:
         """Check, align and colour-match the rig by its first frame; None if fewer than two masks have a subject."""
