@@ -15,6 +15,7 @@ from reference.ball import photograph
 from reference.ball_rig import CAMERAS, make_rig, rig_text
 
 from viewmend.cli import main
+from viewmend.contrib.live_rig.aligner import ImageGroup, TimedImages
 from viewmend.contrib.live_rig.rig_file import read_rig
 from viewmend.contrib.live_rig.rig_source import RigFileSource
 from viewmend.data.camera_images import CameraImages
@@ -129,6 +130,76 @@ def test_the_default_tolerance_is_half_an_interval_of_the_rate_in_use(rig):
     assert supply._aligner.counts["c1"]["misaligned"] == 0
     [group] = supply._aligner.take(start_s + 60)
     assert set(group.by_camera) == {"c0", "c1"}
+
+
+def test_a_slow_rig_waits_longer_for_a_stream(rig, monkeypatch):
+    timeouts_s = []
+
+    def refuse(*_, timeout, **__):
+        timeouts_s.append(timeout)
+        raise ValueError("nobody there")
+
+    supplies = [RigFileSource(rig, fps=fps, align=False) for fps in (15.0, 0.5, 0.1)]
+    monkeypatch.setattr("av.open", refuse)
+    for supply in supplies:
+        camera = replace(supply._workers["c0"].camera, url="rtsp://127.0.0.1/a")
+        worker = supply._make_worker(camera)
+        with pytest.raises(OSError, match="nobody there"):
+            next(worker._connect(worker))
+    assert timeouts_s == [(5.0, 1.0), (5.0, 5.0), (25.0, 25.0)]
+
+
+def group_of(names):
+    """The images that these cameras took at one time."""
+    seen = photograph(CAMERAS.select(names))
+    images = [
+        CameraImages(rgb.movedim(0, -1).numpy(), mask.numpy(), depth=None)
+        for rgb, mask in zip(seen.rgb, seen.mask, strict=True)
+    ]
+    return ImageGroup(0.0, {name: TimedImages(0.0, one) for name, one in zip(names, images, strict=True)})
+
+
+@pytest.fixture
+def begun(rig):
+    """A rig that has begun, whose cameras were not started."""
+    supply = RigFileSource(rig, align=False, match_colours=False, tighten_masks=False)
+    supply._new_workers = []
+    supply._begin_rig()
+    return supply
+
+
+def test_a_rig_has_all_cameras_though_its_first_frame_lacks_some(begun):
+    begun._first_frame_deadline_s = 0.0
+    begun._add_group(group_of(CAMERAS.names[1:]))
+    assert newest(begun).cameras.names == CAMERAS.names[1:] and begun.rig.cameras.names == CAMERAS.names
+
+
+def test_a_frame_has_two_usable_cameras(begun):
+    begun._add_group(group_of(CAMERAS.names))
+    begun._prepared = replace(begun._prepared, left_out=CAMERAS.names[:2])
+    begun._add_group(group_of(CAMERAS.names[1:3]))
+    assert begun.span.end == 1 and begun.status.state == "failing"
+    assert "at least two usable cameras, got 1" in begun.status.error
+    begun._add_group(group_of(CAMERAS.names[1:4]))
+    assert begun.span.end == 2 and begun.status.state == "ready"
+
+
+def test_a_rig_says_why_its_connected_cameras_make_no_frame(begun):
+    now_s = time.monotonic()
+    begun._check_cameras(now_s)
+    assert "expected at least two cameras, got 0; 'c0': silent" in begun.status.error
+    for worker in begun._workers.values():
+        worker.up = True
+    begun._check_cameras(now_s + 1)
+    assert "'c0': silent" in begun.status.error, "images may be on their way"
+    begun._check_cameras(now_s + 10)
+    assert "got none; check clock and offset_ms" in begun.status.error
+    begun._workers["c1"].error = "expected images of 48 x 48 pixels"
+    begun._check_cameras(now_s + 11)
+    assert "'c1': expected images of 48 x 48 pixels" in begun.status.error
+    begun._add_group(group_of(CAMERAS.names))
+    begun._check_cameras(time.monotonic())
+    assert begun.status.state == "ready" and begun.status.error is None
 
 
 def test_recordings_that_do_not_overlap_are_an_error_of_the_rig(rig, monkeypatch):

@@ -27,6 +27,10 @@ from viewmend.types import MultiViewFrame
 
 WATCH_S = 1.0
 """The rig's file is checked for changes at this interval, in seconds."""
+UNMATCHED_S = 5.0
+"""No images of two connected cameras at the same time for this many seconds and `UNMATCHED_TICKS` are an error."""
+UNMATCHED_TICKS = 3.0
+"""Two cameras that send an image per tick have images of the same tick after at most this many."""
 REPORT_S = 30.0
 """Losses are reported at this interval, in seconds."""
 FIRST_FRAME_S = 3.0
@@ -91,6 +95,8 @@ class RigFileSource(LiveSource):
         """Workers that `_begin_rig` is going to start."""
         self._first_frame_deadline_s: float | None = None
         """When the first frame is added even if cameras are missing; None until two cameras have sent images."""
+        self._matched_s = 0.0
+        """When images of two cameras matched last, or could not because fewer were connected."""
         self._stopped = False
         self._stamp = FileStamp.of(path)
         self._reported: dict[str, dict[str, int]] = {}
@@ -188,6 +194,7 @@ class RigFileSource(LiveSource):
         up = None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32)
         self.begin(rig.name, rig.fps, bounds, up)
         self.status = replace(self.status, error="waiting for the cameras")
+        self._matched_s = time.monotonic()
         for worker in self._new_workers:
             worker.start()
 
@@ -195,6 +202,7 @@ class RigFileSource(LiveSource):
         watched_s = time.monotonic()
         reported_s = watched_s
         while not self._stopped:
+            now_s = time.monotonic()
             try:
                 with self._cameras_lock:
                     self._cameras_lock.wait(0.1)
@@ -203,11 +211,10 @@ class RigFileSource(LiveSource):
                     self._add_group(group)
             except Exception as error:  # the thread goes on, whatever happens to a frame
                 self._set_error(f"{type(error).__name__}: {error}"[:400])
-            now_s = time.monotonic()
             if now_s > watched_s + WATCH_S:
                 watched_s = now_s
                 self._reload_if_changed()
-                self._check_cameras()
+                self._check_cameras(now_s)
             if now_s > reported_s + REPORT_S:
                 reported_s = now_s
                 self._report_losses()
@@ -217,6 +224,7 @@ class RigFileSource(LiveSource):
         names = [name for name in self._cameras.names if name in group.by_camera]
         if len(names) < 2:
             return
+        self._matched_s = time.monotonic()
 
         # The first frame waits for all cameras.
         if self._prepared is None and len(names) < len(self._cameras):
@@ -288,13 +296,20 @@ class RigFileSource(LiveSource):
             "the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new_workers)
         )
 
-    def _check_cameras(self) -> None:
-        """Report an error while there are too few cameras."""
+    def _check_cameras(self, now_s: float) -> None:
+        """Report an error while there are too few cameras, or their images do not match."""
         silent = [worker for worker in self._workers.values() if not worker.up]
         connected = len(self._workers) - len(silent)
         if connected < 2:
             first = f"'{silent[0].camera.name}': {silent[0].error or 'silent'}"
             self._set_error(f"expected at least two cameras, got {connected}; {first}")
+            self._matched_s = now_s
+        elif now_s > self._matched_s + UNMATCHED_S + UNMATCHED_TICKS / self._rig.fps + self._rig.wait_s:
+            faulty = [worker for worker in self._workers.values() if worker.error]
+            reason = (
+                f"'{faulty[0].camera.name}': {faulty[0].error}" if faulty else "check clock and offset_ms"
+            )
+            self._set_error(f"expected images of two cameras at the same time, got none; {reason}")
 
     def _set_error(self, error: str) -> None:
         """Set the status to an error, and log it if it is a new one."""
