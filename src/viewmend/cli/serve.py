@@ -280,6 +280,7 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
         server=config,
         stream=stream_config(remote),
         device=options.device,
+        precision=options.precision,
         replicas=(options.replicas, options.max_replicas or options.replicas),
         store_mb=options.memory_mb / 2,
     )

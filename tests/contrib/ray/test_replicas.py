@@ -8,13 +8,15 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 from live.live_servers import PIPELINE, get, in_own_loop
 
 from viewmend.cli import main
-from viewmend.contrib.ray import cluster
+from viewmend.contrib.ray import cluster, replicas
 from viewmend.contrib.ray.replicas import ManyViewers, StartWhenReady, _demand_no_serve, serving
 from viewmend.live.client import Client
 from viewmend.live.push import PushSource
@@ -101,6 +103,24 @@ def test_replicas_of_one_machine_share_its_memory():
         config = ServerConfig(port=taken.getsockname()[1])
         with serving(ManyViewers(**vars(served(2)) | {"server": config}), "local"):
             pass
+
+
+def test_all_models_have_the_precision_of_the_option(monkeypatch, capsys):
+    settings, asked, made = [], [], []
+
+    def stop(**served):
+        settings.append(ManyViewers(**served))
+        raise ValueError("enough")
+
+    monkeypatch.setattr("viewmend.cli.serve.import_object", lambda name: stop)
+    assert main(["serve", "studio", "--ray", "local", "--precision", "float32"]) == 2
+    assert "enough" in capsys.readouterr().err
+    monkeypatch.setattr(replicas, "error_model_for", lambda *given: asked.append(given[1:]))
+    monkeypatch.setattr(replicas, "Renderer", lambda *given, **more: made.append(Renderer(*given, **more)))
+    monkeypatch.setattr(replicas, "RenderService", lambda *_: None)
+    monkeypatch.setattr(replicas, "LiveServer", MagicMock())
+    replicas._replica(replace(settings[0], load_inpainter=SmoothFill), replicas.RayIngest(None))
+    assert asked == [("cpu", "float32")] and made[0]._precision == "float32"
 
 
 async def ask(app, path, query=b"", headers=()):

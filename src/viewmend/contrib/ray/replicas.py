@@ -56,6 +56,8 @@ class ManyViewers:
     server: ServerConfig
     stream: StreamConfig
     device: str
+    precision: str = "auto"
+    """Number format of the error model, and of models that viewers compare, as in `load_inpainter`."""
     replicas: tuple[int, int]
     """Minimum and maximum number."""
     store_mb: float
@@ -215,8 +217,16 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
     stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
     inpainter = served.load_inpainter()
     in_page = served.server.draws_in_page
-    error_model = error_model_for(inpainter, served.device)
-    renderer = Renderer(source, inpainter, stream, served.device, error_model, draws_in_page=in_page)
+    error_model = error_model_for(inpainter, served.device, served.precision)
+    renderer = Renderer(
+        source,
+        inpainter,
+        stream,
+        served.device,
+        error_model,
+        draws_in_page=in_page,
+        precision=served.precision,
+    )
     service = RenderService(renderer, source)
 
     async def ready() -> None:
