@@ -60,6 +60,15 @@ def test_all_cameras_of_a_frame_are_the_frame_itself():
     assert len(frame.select([]).cameras) == 0 == len(frame.select([]).rgb)
 
 
+def test_names_are_a_list_and_no_string():
+    cameras = ring(3, 16)
+    frame = photograph(replace(cameras, names=("1", "2", "12")))
+    for choose in (frame.select, frame.without):
+        with pytest.raises(ValueError, match=r"as a list of names, got the string '12'; write \['12'\]"):
+            choose("12")
+    assert frame.without(["12"]).cameras.names == ("1", "2")
+
+
 # What a frame's check refuses.
 
 RIG = photograph(ring(3, 16))

@@ -20,12 +20,12 @@ from torch import Tensor
 from viewmend.frame_cache import CachedFrame, DepthProvider, all_masks, cache_frame, check_provider, evict
 from viewmend.fused_geometry import FusedFrame, fuse_geometry
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, check_names
 from viewmend.geometry.fusion import FusionConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.threads import all_threads, one_thread
-from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State, check_exclude
+from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
 from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask, with_rim
@@ -355,7 +355,7 @@ class Stream:
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
-        check_exclude(exclude)
+        check_names("exclude", exclude)
         if view.target_mask is not None:  # resampling may overshoot
             view = replace(view, target_mask=view.target_mask.clamp(0, 1).contiguous())
 
@@ -433,7 +433,7 @@ class Stream:
         target_mask: Float[Tensor, "height width"] | None,
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
-        check_exclude(exclude)
+        check_names("exclude", exclude)
         target.check_single()
         check_target_mask(target_mask, target.max_size_px[::-1])
         stop_if_cancelled()

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.cameras import Cameras, concatenate_cameras
+from viewmend.geometry.cameras import Cameras, check_names, concatenate_cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.rim import rim_depth
 from viewmend.utils.tensors import OnDevice, check_tensor, extremes
@@ -109,10 +109,11 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         return any(bool((mask > FOREGROUND).any()) for mask in self.per_camera("mask"))
 
     def select(self, names: Sequence[str]) -> "MultiViewFrame":
-        """The same frame with only these cameras, in this order; ValueError for an unknown name.
+        """The same frame with only these cameras, in this order; ValueError for an unknown name or a string.
 
         Images and masks are copied only when they are read; ground-truth depth at once.
         """
+        check_names("names", names)
         if tuple(names) == self.cameras.names:
             return self
         cameras = self.cameras.select(names)
@@ -152,6 +153,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
 
     def without(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same frame without these cameras; names that are not in the frame are ignored."""
+        check_names("names", names)
         return self.select([n for n in self.cameras.names if n not in names])
 
 

@@ -48,6 +48,8 @@ def test_cameras_can_be_selected(plain):
         open_capture(plain.path, ["e"])
     with pytest.raises(CaptureError, match="each once"):
         open_capture(plain.path, ["a", "a"])
+    with pytest.raises(ValueError, match="expected cameras as a list of names, got the string 'ca'"):
+        open_capture(plain.path, "ca")
 
 
 @pytest.mark.parametrize("metres_per_unit", [0.001, 1.0])

@@ -73,6 +73,20 @@ def test_a_reduced_capture_states_the_cameras_of_its_frames():
     assert torch.equal(frame.cameras.K, prepared.cameras.K)
 
 
+@pytest.mark.parametrize(
+    "inputs, message",
+    [
+        ("c1", r"expected inputs as a list of names, got the string 'c1'"),
+        (["c0", "c1", "cO2"], r"expected cameras among \[.*\], got \['cO2'\]; check the spelling"),
+    ],
+)
+def test_unknown_inputs_are_refused_before_frames_are_read(inputs, message, monkeypatch):
+    capture = BallCapture(ring(6))
+    monkeypatch.setattr(capture, "read", lambda time: pytest.fail("a frame was read"))
+    with pytest.raises(ValueError, match=message):
+        prepare(capture, inputs)
+
+
 class Absent(BallCapture):
     """A rig of which camera `c1` has nothing at time 1."""
 

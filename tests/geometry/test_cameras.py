@@ -60,6 +60,8 @@ def test_selection_by_name_and_by_position():
     assert cameras[1:3].names == ("c1", "c2") and cameras[-1].names == ("c3",) and len(cameras[[3, 3]]) == 2
     with pytest.raises(ValueError, match="spelling"):
         cameras.select(["c9"])
+    with pytest.raises(ValueError, match=r"names as a list of names, got the string 'c2'; write \['c2'\]"):
+        cameras.select("c2")
 
 
 def test_pixel_centers_start_at_a_half():

@@ -32,7 +32,7 @@ from viewmend.data.source import CaptureSource, CaptureWrapper
 from viewmend.data.video_clock import RATE_TOLERANCE, Track, VideoClock, match_tracks, video_track
 from viewmend.data.videos import is_video, video_properties
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, check_names
 from viewmend.geometry.rigid import rigid
 from viewmend.types import MultiViewFrame
 
@@ -345,6 +345,7 @@ def _select(
 ) -> tuple[NativeCamera, ...]:
     if names is None:
         return cameras
+    check_names("cameras", names)
     by_name = {camera.name: camera for camera in cameras}
     unknown = [name for name in names if name not in by_name]
     if unknown or not names or len(set(names)) < len(names):

@@ -19,7 +19,7 @@ from viewmend.data.errors import CaptureError, Issue, without_consequences
 from viewmend.data.loose_masks import LooseMasks, find_loose_masks
 from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, check_names
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.types import MultiViewFrame
 
@@ -142,7 +142,7 @@ def prepare(
     Raises:
         CaptureError: a frame cannot be read, its masks or calibration are unusable, or no
             frame has a subject.
-        ValueError: the input cameras look away from each other.
+        ValueError: `inputs` is a string or has an unknown name, or the input cameras look away from each other.
 
     Examples:
         >>> from viewmend import prepare
@@ -151,7 +151,10 @@ def prepare(
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 32, 32])
     """
-    names = None if inputs is None else tuple(inputs)
+    names = None
+    if inputs is not None:
+        check_names("inputs", inputs)
+        names = source.cameras.select(tuple(inputs)).names
     frame = first_with_subject(source, names, first, least=2)
     if frame is None:
         return PreparedCapture(source, None, max_image_size, names)

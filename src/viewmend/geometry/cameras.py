@@ -124,8 +124,9 @@ class Cameras(OnDevice):
         """The cameras of these names, in this order.
 
         Raises:
-            ValueError: a name is not among `names`.
+            ValueError: a name is not among `names`, or a string is given instead of a list.
         """
+        check_names("names", names)
         unknown = [n for n in names if n not in self.names]
         if unknown:
             raise ValueError(f"expected cameras among {list(self.names)}, got {unknown}; check the spelling")
@@ -215,6 +216,12 @@ def _rows(values: Tensor, index: Sequence[int]) -> Tensor:
     if list(index) == list(range(first, first + len(index))):
         return values[first : first + len(index)]
     return torch.stack([values[row] for row in index])
+
+
+def check_names(what: str, names: Sequence[str]) -> None:
+    """ValueError if these are a string and no list of names: each of its letters would be taken as one."""
+    if isinstance(names, str):
+        raise ValueError(f"expected {what} as a list of names, got the string '{names}'; write ['{names}']")
 
 
 def is_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.geometry.cameras import check_names
 from viewmend.models.compositing import Background, cut, from_background, to_background
 from viewmend.types import OVERSHOOT, CompletedView, ContextViews, IncompleteView
 from viewmend.utils.tensors import extremes, to_mmap
@@ -57,14 +58,6 @@ class RenderQuality:
             raise ValueError(f"expected a refine_fraction from 0 to 1 or None, got {self.refine_fraction}")
 
 
-def check_exclude(exclude: Sequence[str]) -> None:
-    """ValueError if this is a string and no list of names: its letters would exclude nothing."""
-    if isinstance(exclude, str):
-        raise ValueError(
-            f"expected exclude as a list of names, got the string '{exclude}'; write ['{exclude}']"
-        )
-
-
 class ContextProvider:
     """The camera images that an inpainter may use, and a memory of what it computed from them.
 
@@ -103,7 +96,7 @@ class ContextProvider:
         Raises:
             ValueError: `exclude` is a string.
         """
-        check_exclude(exclude)
+        check_names("exclude", exclude)
         self.quality = quality or RenderQuality()
         self.encoding_ms = 0.0
         """Milliseconds spent on encoding camera images so far."""
