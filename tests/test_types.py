@@ -130,6 +130,33 @@ def of_cameras(**fields):
             of_cameras(size_px=CAMERAS.size_px.float()),
             r"expected size_px as torch.int64 .*got torch.float32; .*\.long\(\)",
         ),
+        (
+            of_cameras(K=CAMERAS.K.mT),
+            r"camera 'c0': expected K as \[\[fx, skew, cx\].*; convert it to OpenCV's convention",
+        ),
+        (of_cameras(K=CAMERAS.K * math.nan), "camera 'c0': expected K as .*, got .*nan"),
+        *(
+            (
+                of_cameras(camera_from_world=pose),
+                "camera 'c1': expected camera_from_world as a rotation and a translation.*; divide the rotation",
+            )
+            for pose in (
+                CAMERAS.camera_from_world * torch.tensor([1.0, 2.0, 1.0])[:, None, None],
+                CAMERAS.camera_from_world
+                * torch.tensor([[1.0] * 4, [1.0, 1.0, -1.0, 1.0], [1.0] * 4])[..., None],
+                CAMERAS.camera_from_world / torch.tensor([1.0, 0.0, 1.0])[:, None, None],
+                CAMERAS.camera_from_world
+                * torch.tensor([[1.0] * 4, [1.0, 1.0, 1.0, 0.0], [1.0] * 4])[..., None],
+            )
+        ),
+        (
+            forged(RIG, cameras=CAMERAS.resized(8, 8)),
+            "zeros beyond .* at most 8 x 8, got images of 16 x 16 .*; give the K and size_px",
+        ),
+        (
+            forged(RIG, cameras=CAMERAS.resized(8, 16), mask=None),
+            "zeros beyond .* at most 8 x 16, got images of 16 x 16 .*; give the K and size_px",
+        ),
         (of_cameras(size_px=TALL), r"rgb of shape \(3, 3, 20, 16\).*got \(3, 3, 16, 16\)"),
         (RIG.select([]), "expected at least one camera, got none"),
     ],
@@ -139,7 +166,7 @@ def test_frames_of_wrong_types_or_sizes_are_refused(frame, message):
         frame.check()
     with pytest.raises(ValueError, match=message):
         Stream(Telea()).add_frame(frame)
-    if frame.mask is not RIG.mask and len(frame.cameras):
+    if frame.mask is not None and frame.mask is not RIG.mask and len(frame.cameras):
         with pytest.raises(ValueError, match=message):
             forged(Silhouettes(RIG.mask, CAMERAS), mask=frame.mask).check()
 

@@ -141,7 +141,10 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         return MultiViewFrame._of_parts(parts, **own)
 
     def check(self) -> None:
-        """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1."""
+        """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1.
+
+        Masks, or images if there are none, may not have content beyond the cameras' size_px.
+        """
         self.cameras.check()
         width, height = self.cameras.max_size_px
         convert = "scale it to 0 to 255, and convert it with .byte()"
@@ -149,7 +152,10 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         shape = (len(self.cameras), 3, height, width)
         check_tensor("rgb", self.rgb, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True)
         if self.mask is not None:
-            _check_mask(self.mask, (len(self.cameras), *self.rgb.shape[2:]))
+            _check_mask(self.mask, (len(self.cameras), *self.rgb.shape[2:]), (height, width))
+        else:
+            beyond = sum(int(part.sum()) for part in _padding(self.rgb, (height, width)))
+            _check_padding(beyond, self.rgb, (height, width))
 
     def without(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same frame without these cameras; names that are not in the frame are ignored."""
@@ -210,7 +216,7 @@ class Silhouettes(OnDevice):
         """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1."""
         self.cameras.check()
         width, height = self.cameras.max_size_px
-        _check_mask(self.mask, (len(self.cameras), height, width))
+        _check_mask(self.mask, (len(self.cameras), height, width), (height, width))
 
     def select(self, names: Sequence[str]) -> "Silhouettes":
         """The masks of these cameras, in this order; ValueError for an unknown name."""
@@ -227,14 +233,37 @@ class Silhouettes(OnDevice):
         return Silhouettes(torch.cat(padded), concatenate_cameras([self.cameras, others.cameras]))
 
 
-def _check_mask(mask: object, shape: tuple[int, ...]) -> None:
-    """ValueError unless these are masks of 0 to 255, of this shape or padded; they may be empty."""
+def _check_mask(mask: object, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    """ValueError unless these are masks of 0 to 255, of this shape or padded; they may be empty.
+
+    They have to be 0 beyond `size`, the height and width of the largest camera.
+    """
     convert = "scale it to 0 to 255, and convert it with .byte()"
     arrange = "give one mask per camera, as large as the images"
     masks = check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True)
-    largest, total = torch.stack([masks.max().long(), masks.sum()]).tolist()  # waits for a GPU only once
+    padding = [part.sum() for part in _padding(masks, size)]
+    # This waits for a GPU only once
+    largest, total, *beyond = torch.stack([masks.max().long(), masks.sum(), *padding]).tolist()
+    _check_padding(sum(beyond), masks, size)
     if largest == 1 and total > NOISE * masks.numel():
         raise ValueError("expected masks of 0 to 255, got masks of 0 and 1; multiply them by 255")
+
+
+def _padding(images: Tensor, size: tuple[int, int]) -> list[Tensor]:
+    """The parts of a stack of images below and to the right of this height and width, without those of no pixels."""
+    height, width = size
+    return [part for part in (images[..., height:, :], images[..., width:]) if part.numel()]
+
+
+def _check_padding(total: int, images: Tensor, size: tuple[int, int]) -> None:
+    """ValueError if the sum of the padding of images is not 0: their cameras are those of other images."""
+    if total:
+        height, width = size
+        raise ValueError(
+            f"expected zeros beyond the cameras' size_px of at most {width} x {height}, got images of "
+            f"{images.shape[-1]} x {images.shape[-2]} with content there; give the K and size_px of images of this "
+            "size, or pad with zeros"
+        )
 
 
 @dataclass(frozen=True)

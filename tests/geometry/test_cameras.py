@@ -7,7 +7,7 @@ import pytest
 import torch
 from geometry.solids import camera_at, dome
 
-from viewmend.geometry.cameras import concatenate_cameras, pinhole, pixel_centers, project
+from viewmend.geometry.cameras import concatenate_cameras, is_intrinsics, pinhole, pixel_centers, project
 from viewmend.geometry.rigid import invert_rigid, is_rotation, look_at, rotation_from_axis_angle
 
 
@@ -122,3 +122,9 @@ def test_rotations_are_told_from_other_matrices():
     assert not is_rotation(torch.eye(3) * 1.01)
     assert is_rotation(torch.stack([torch.eye(3), torch.zeros(3, 3)])).tolist() == [True, False]
     assert not is_rotation(torch.full((3, 3), torch.nan))
+
+
+def test_intrinsics_may_be_rounded():
+    K = torch.tensor([[500.0, 0.1, 320.0], [1e-5, 500.0, 240.0], [0.0, 1e-8, 1.0]])
+    assert is_intrinsics(K.tolist())
+    assert not any(is_intrinsics(wrong.tolist()) for wrong in (K.mT, -K, K / 2, K * torch.inf, K * torch.nan))

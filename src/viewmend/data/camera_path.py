@@ -39,7 +39,7 @@ class PathFile(Struct, frozen=True):
             expected = "a rotation and translation with the last row 0 0 0 1"
             next_step = "write rigid motions world_from_camera"
             raise ValueError(f"pose {pose}: expected {expected}, got another matrix; {next_step}")
-        if self.K is not None and not bool(is_intrinsics(torch.tensor(self.K))):
+        if self.K is not None and not is_intrinsics(self.K):
             expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
             raise ValueError(f"expected 'K' as {expected}, got {shown(self.K)}; correct it")
         if (self.width is None) != (self.height is None):

@@ -54,7 +54,7 @@ class _CameraEntry(Struct, frozen=True, kw_only=True):
     offset_ms: Annotated[float, Meta(ge=-1e9, le=1e9)] = 0.0
 
     def __post_init__(self) -> None:
-        if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
+        if not is_intrinsics(self.K):
             expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
             raise _invalid(
                 "K", expected, shown(self.K), "convert the calibration to OpenCV's convention, in pixels"

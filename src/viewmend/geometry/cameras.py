@@ -6,16 +6,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.rigid import invert_rigid
+from viewmend.geometry.rigid import invert_rigid, is_rotation
 from viewmend.utils.tensors import OnDevice, check_tensor
 
 FARTHEST = 2e4
 """Largest distance of cameras from the origin, relative to the extent of their rig; at that
 distance, 32-bit positions are exact to a thousandth of the extent."""
+
+ROUNDING = 1e-6
+"""Entries of K and of poses that have to be 0 or 1 may differ from it by this much, the one in the
+second row of K relative to fy: decompositions and products of matrices leave such remainders."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,10 @@ class Cameras(OnDevice):
         return made
 
     def check(self) -> None:
-        """ValueError unless names differ, and K, poses and sizes are tensors of the fields' types, one per name."""
+        """ValueError unless names differ, and K, poses and sizes are tensors of the fields' types, one per name.
+
+        Each K has to be an upper triangular matrix with the last row 0 0 1, and each pose a rigid motion.
+        """
         count = len(self.names)
         if not count:
             raise ValueError("expected at least one camera, got none; name the cameras")
@@ -99,7 +106,29 @@ class Cameras(OnDevice):
             arrange="give width and height of each camera",
         )
 
+        self._check_form()
         self._check_distance()
+
+    def _check_form(self) -> None:
+        """ValueError unless each K is one of a pinhole camera, and each pose a rotation and a translation."""
+        host = self.on_host
+        poses = host.camera_from_world.detach()
+        turns = is_rotation(poses[:, :3, :3])
+        for name, K, pose, turn in zip(
+            self.names, host.K.tolist(), poses.tolist(), turns.tolist(), strict=True
+        ):
+            if not is_intrinsics(K):
+                raise ValueError(
+                    f"camera '{name}': expected K as [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, "
+                    f"got {K}; convert it to OpenCV's convention, in pixels"
+                )
+            *upper, last = pose
+            is_shift = all(math.isfinite(shift) for *_, shift in upper)
+            if not turn or not is_shift or math.dist(last, (0, 0, 0, 1)) > ROUNDING:
+                raise ValueError(
+                    f"camera '{name}': expected camera_from_world as a rotation and a translation, with the last row "
+                    f"0 0 0 1, got {pose}; divide the rotation by any scale, and check axes and signs"
+                )
 
     def _check_distance(self) -> None:
         """ValueError if the cameras are so far from the world's origin that 32-bit poses are too coarse."""
@@ -224,10 +253,12 @@ def check_names(what: str, names: Sequence[str]) -> None:
         raise ValueError(f"expected {what} as a list of names, got the string '{names}'; write ['{names}']")
 
 
-def is_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:
-    """Whether K is [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0."""
-    last = (K[..., 2, :] == K.new_tensor([0, 0, 1])).all(-1)
-    return (K[..., 0, 0] > 0) & (K[..., 1, 1] > 0) & (K[..., 1, 0] == 0) & last
+def is_intrinsics(K: Sequence[Sequence[float]]) -> bool:
+    """Whether K is [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], but for rounding, with fx and fy above 0."""
+    (fx, skew, cx), (zero, fy, cy), last = K
+    is_finite = all(map(math.isfinite, (fx, skew, cx, fy, cy)))
+    is_upper = abs(zero) <= ROUNDING * fy and math.dist(last, (0, 0, 1)) <= ROUNDING
+    return is_finite and is_upper and fx > 0 and fy > 0
 
 
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:

@@ -144,7 +144,7 @@ class PushedCamera(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         check_rotation(self.R)
-        if not bool(is_intrinsics(torch.tensor(self.K).view(3, 3))):
+        if not is_intrinsics([self.K[:3], self.K[3:6], self.K[6:]]):
             raise ProtocolError(
                 "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy, got another matrix"
             )
