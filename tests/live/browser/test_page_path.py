@@ -1,6 +1,7 @@
 """Camera paths: recorded, previewed, and exported as a film that plays."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -56,6 +57,15 @@ def test_views_that_were_added_become_a_film(view, tmp_path):
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
 
 
+def save_path(view, tmp_path) -> Path:
+    """Press the button; the file."""
+    with view.page.expect_download() as waiting:
+        view.page.get_by_role("button", name="Save JSON").click()
+    path = tmp_path / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    return path
+
+
 def test_own_movement_is_recorded_and_time_may_stand_still(desktop, tmp_path):
     page = desktop.page
     page.locator("#seek").fill("7")
@@ -76,6 +86,16 @@ def test_own_movement_is_recorded_and_time_may_stand_still(desktop, tmp_path):
     ]
     assert sum(way) > 0.5
     assert max(way) < 0.6
+    recorded = page.locator("#path-text").inner_text()
+    saved = save_path(desktop, tmp_path)
+    content = json.loads(saved.read_text())
+    assert content["points"][0]["seconds"] == 0
+    for point in content["points"]:
+        point["seconds"] += 0.02  # files of earlier versions begin a little after the click
+    saved.write_text(json.dumps(content))
+    page.get_by_role("button", name="Clear").click()
+    page.locator("#path-file").set_input_files(saved)
+    desktop.until(lambda: page.locator("#path-text").inner_text() == recorded)
 
 
 def test_preview_goes_along_the_path_and_a_hand_stops_it(desktop):
@@ -144,10 +164,7 @@ def test_a_film_says_how_far_it_is_and_is_called_off(desktop):
 def test_a_path_goes_out_as_json_for_mend_and_comes_back(desktop, tmp_path):
     page = desktop.page
     two_views(page)
-    with page.expect_download() as waiting:
-        page.get_by_role("button", name="Save JSON").click()
-    path = tmp_path / waiting.value.suggested_filename
-    waiting.value.save_as(path)
+    path = save_path(desktop, tmp_path)
     cameras = read_camera_path(path, orbit([0.0], (32, 32)))
     assert len(cameras) == 61
     start = eye(desktop.server.looks[0]["camera"])

@@ -150,6 +150,7 @@ export class Track {
    * @returns {boolean} whether there is room for more
    */
   record(pose, time, now) {
+    if (!this.points.length) this.recordingSince = now;
     const seconds = (now - this.recordingSince) / 1000;
     if (seconds * FPS >= MAX_POSES - 1) return false;
     const due = !this.points.length || seconds - this.seconds >= RECORDED_SHARE / FPS;

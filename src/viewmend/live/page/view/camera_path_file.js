@@ -90,14 +90,13 @@ export function readPoints(content, rig, fov, time) {
  */
 function readPoint(view, i, views) {
   const pose = parsePose(view?.pose ?? null);
-  const later = i === 0 ? view?.seconds === 0 : view?.seconds > views[i - 1].seconds;
+  const later = i === 0 ? Number.isFinite(view?.seconds) : view?.seconds > views[i - 1].seconds;
   if (!pose || !later || !(view.time >= 0)) {
     throw new Error(
-      `view ${i + 1}: expected a pose, later seconds than the view before (0 for the first), and a time; ` +
-        "correct the file",
+      `view ${i + 1}: expected a pose, later seconds than the view before, and a time; correct the file`,
     );
   }
-  return { pose, seconds: view.seconds, time: view.time };
+  return { pose, seconds: view.seconds - views[0].seconds, time: view.time };
 }
 
 /**
