@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from live.browser import scene
 from live.browser.conftest import View, opened
 from live.browser.stand_in import StandIn
 
@@ -15,6 +16,9 @@ MIN_FRACTION = 0.01
 """A half of the picture shows at least this fraction of pixels that are not background."""
 BRIGHT = 40
 """Brighter pixels are not background."""
+SEND_KEY = "([type, init]) => window.dispatchEvent(new KeyboardEvent(type, init))"
+ALT_GR = ("ctrlKey", "altKey", "modifierAltGraph")
+"""What browsers on Windows report while AltGr is held."""
 
 
 def pairs(keys: tuple[str, ...]) -> list[str]:
@@ -82,6 +86,31 @@ def test_keys_between_two_repaints_act_on_the_newest_pose(browser, desktop):
     desktop.page.evaluate(press, ["KeyN", "KeyX", "KeyR", "KeyX"])
     desktop.until(lambda: desktop.server.looks[-1]["without"] == ["cam00"])
     desktop.until(lambda: "only at a camera" in desktop.page.locator("#right-name").inner_text())
+
+
+def test_characters_act_wherever_the_keyboard_has_them(browser, desktop):
+    """A German keyboard has "?" on the key of "-", "+" on that of "]", and "[" on that of "8", with AltGr."""
+    page, server = desktop.page, desktop.server
+
+    def send(event: str, key: str, code: str, alt_gr: bool = False) -> None:
+        page.evaluate(SEND_KEY, [event, {"key": key, "code": code, **dict.fromkeys(ALT_GR, alt_gr)}])
+
+    def distance() -> float:
+        camera = server.looks[-1]["camera"]
+        return float(np.linalg.norm(np.reshape(camera["R"], (3, 3)) @ scene.CENTER + camera["T"]))
+
+    before = distance()
+    send("keydown", "?", "Minus")
+    assert page.get_by_role("dialog").is_visible()
+    page.get_by_role("button", name="Close the help").click()
+    send("keydown", "[", "Digit8", alt_gr=True)
+    desktop.until(lambda: server.clocks)
+    assert server.clocks[0]["speed"] < 1
+    send("keydown", "+", "BracketRight")
+    desktop.until(lambda: distance() < before - 0.1)
+    send("keyup", "*", "BracketRight")  # shift was pressed meanwhile
+    desktop.until(lambda: not server.looks[-1]["moving"])
+    assert len(server.clocks) == 1 and server.looks[-1]["modes"] == ["completed"]
 
 
 def test_a_view_at_rest_has_no_frame_rate_and_says_when_it_is_refined(browser, server):

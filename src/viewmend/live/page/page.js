@@ -176,10 +176,10 @@ class Page {
       "?": tools.toggleHelp,
       Space: () => transport.toggle(),
       KeyL: () => transport.goLive(),
-      Comma: () => transport.step(-1),
-      Period: () => transport.step(1),
-      BracketLeft: () => transport.changeSpeed(-1),
-      BracketRight: () => transport.changeSpeed(1),
+      ",": () => transport.step(-1),
+      ".": () => transport.step(1),
+      "[": () => transport.changeSpeed(-1),
+      "]": () => transport.changeSpeed(1),
     };
   }
 

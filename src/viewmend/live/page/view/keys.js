@@ -19,8 +19,8 @@ const WALK = {
   KeyW: [0, 0, 1],
   KeyS: [0, 0, -1],
 };
-/** The sign of each zoom key; 1 moves away. */
-const ZOOM = { Equal: -1, NumpadAdd: -1, Minus: 1, NumpadSubtract: 1 };
+/** The sign of each zoom character; 1 moves away. A "+" may need the shift key, a "=" on the same key not. */
+const ZOOM = { "+": -1, "=": -1, "-": 1 };
 /** The keys that move a slider. */
 const SLIDER_KEYS = [...Object.keys(ARROWS), "Home", "End", "PageUp", "PageDown"];
 
@@ -44,20 +44,27 @@ export class Keys {
    */
   constructor(motion, actions, wake) {
     this.motion = motion;
-    /** @type {Set<string>} */
-    this.held = new Set();
+    /**
+     * The keys that are held, by their code: a zoom character, or the code.
+     * @type {Map<string, string>}
+     */
+    this.held = new Map();
     this.shift = false;
     window.addEventListener("keydown", (event) => {
       // macOS does not report the release of other keys while the Command key is held
       if (event.metaKey) this.held.clear();
-      if (event.altKey || event.ctrlKey || event.metaKey || document.querySelector("dialog[open]")) return;
-      if (isUsedByControl(event)) return;
+      if (event.metaKey || document.querySelector("dialog[open]") || isUsedByControl(event)) return;
+      // a character counts wherever the keyboard has it, also where it needs AltGr
+      const isCharacter = event.key in ZOOM || event.key in actions;
+      const isTyped = isCharacter && event.getModifierState("AltGraph");
+      if ((event.altKey || event.ctrlKey) && !isTyped) return;
       this.shift = event.shiftKey;
-      const continuous = event.code in ARROWS || event.code in WALK || event.code in ZOOM;
+      const name = isCharacter ? event.key : event.code;
+      const continuous = name in ARROWS || name in WALK || name in ZOOM;
       const pressesButton =
         event.target instanceof HTMLButtonElement && (event.code === "Space" || event.code === "Enter");
-      const action = pressesButton ? undefined : (actions[event.key] ?? actions[event.code]);
-      if (continuous) this.held.add(event.code);
+      const action = pressesButton ? undefined : actions[name];
+      if (continuous) this.held.set(event.code, name);
       else if (action && !event.repeat) action();
       if (continuous || action) event.preventDefault();
       wake();
@@ -78,16 +85,16 @@ export class Keys {
     const seconds = Math.min(elapsedMs, MAX_STEP_MS) / 1000;
     const { motion } = this;
     const reach = (motion.goal?.distance ?? 1) * WALK_PER_S * seconds;
-    for (const code of this.held) {
-      if (code in ARROWS) {
-        const [x, y] = /** @type {any} */ (ARROWS)[code];
+    for (const name of this.held.values()) {
+      if (name in ARROWS) {
+        const [x, y] = /** @type {any} */ (ARROWS)[name];
         if (this.shift) motion.pan(x * reach, y * reach, 0);
         else motion.turn(-x * TURN_PER_S * seconds, -y * TURN_PER_S * seconds);
-      } else if (code in WALK) {
-        const [x, y, z] = /** @type {any} */ (WALK)[code];
+      } else if (name in WALK) {
+        const [x, y, z] = /** @type {any} */ (WALK)[name];
         motion.pan(x * reach, y * reach, z * reach);
       } else {
-        motion.zoom(Math.exp(/** @type {any} */ (ZOOM)[code] * ZOOM_PER_S * seconds));
+        motion.zoom(Math.exp(/** @type {any} */ (ZOOM)[name] * ZOOM_PER_S * seconds));
       }
     }
     return this.held.size > 0;
