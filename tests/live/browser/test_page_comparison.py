@@ -1,5 +1,9 @@
 """Models are compared, and cameras left out, while one looks: split view, original, error map and score."""
 
+import re
+from collections import Counter
+from urllib.parse import urlsplit
+
 import cv2
 import numpy as np
 import pytest
@@ -20,8 +24,19 @@ def texts(view, *names: str) -> list[str]:
 
 
 def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
+    tries = Counter()
+
+    def fail_once(route):
+        path = urlsplit(route.request.url).path
+        tries[path] += 1
+        if tries[path] == 1:
+            route.fulfill(status=503, body="{}")
+        else:
+            route.continue_()
+
     with opened(browser, ball, query="?time=0") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
+        view.page.route(re.compile(r"/(camera|frame)\.jpg"), fail_once)
         (session,) = ball.live.registry.sessions
         assert view.page.locator("#input-row").is_hidden()
         view.page.keyboard.press("n")
@@ -29,7 +44,10 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
         view.page.keyboard.press("x")
         view.until(lambda: getattr(session.wanted_look, "without", None) == (NAME,), SCREENSHOT_S)
         view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
-        assert texts(view, "left-name", "right-name") == ["Completed (views)", "Original"]
+        names = ["Completed (views)", "Original"]
+        view.until(lambda: texts(view, "left-name", "right-name") == names, SCREENSHOT_S)
+        assert tries["/camera.jpg"] > 1 and tries["/frame.jpg"] > 1
+        view.errors.clear()  # the browser notes the status
         asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={NAME}&without={NAME}"
         score = float(get(asked)[1]["X-Viewmend-PSNR"])
         assert f"subject {score:.1f} dB" in view.page.locator("#error-name").inner_text()

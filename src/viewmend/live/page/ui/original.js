@@ -7,6 +7,8 @@ import { Scores } from "./scores.js";
 
 /** Images are requested at least this far apart, in milliseconds, while time runs. */
 const MIN_INTERVAL_MS = 250;
+/** An image that could not be loaded is requested again after this long, in milliseconds. */
+const RETRY_MS = 1000;
 
 export class Original {
   /**
@@ -30,7 +32,15 @@ export class Original {
       byId("original").hidden = this.requestedUrl === "" || !this.besideView;
       if (this.requestedUrl) setPhoto("original", this.camera, image);
     });
-    image.addEventListener("error", () => (byId("original").hidden = true));
+    image.addEventListener("error", () => {
+      byId("original").hidden = true;
+      const failed = this.requestedUrl;
+      setTimeout(() => {
+        if (this.requestedUrl !== failed) return;
+        this.requestedUrl = "";
+        setPhoto("original", null, null);
+      }, RETRY_MS);
+    });
     this.scores = new Scores(token, (request, score) => this.#showScore(request, score));
   }
 
@@ -96,6 +106,7 @@ export class Original {
       this.setPhoto("error", request.camera, image);
       URL.revokeObjectURL(image.src);
     };
+    URL.revokeObjectURL(image.src); // of a score that was replaced before its image had loaded
     image.src = URL.createObjectURL(score.blob);
   }
 }

@@ -7,6 +7,10 @@ import { buildAddress } from "../link/address.js";
 const WAIT_MS = 300;
 /** The JPEG quality of the error map. */
 const QUALITY = 90;
+/** The first wait, in milliseconds, before a score is requested again; each further wait is twice as long. */
+const RETRY_MS = 1000;
+/** Status codes of a server that is too busy to answer. */
+const BUSY = [429, 503];
 
 /**
  * @typedef {object} ScoreRequest
@@ -55,10 +59,25 @@ export class Scores {
       const query = { mode: "error", camera: camera.name, time, without, quality: QUALITY };
       for (const [name, value] of Object.entries(query)) url.searchParams.set(name, String(value));
       if (model) url.searchParams.set("model", model);
-      const response = await fetch(url, { signal }).catch(() => null);
+      const response = await fetchWithRetries(url, signal);
       const psnr = Number(response?.headers.get("X-Viewmend-PSNR"));
       const blob = await response?.blob().catch(() => null);
       if (response?.ok && blob && !signal.aborted) this.report(request, { model, psnr, blob });
     }
   }
+}
+
+/**
+ * Fetch, and try again while the server is too busy or unreachable.
+ * @param {URL} url
+ * @param {AbortSignal} signal
+ * @returns {Promise<Response | null>} null if the request was aborted
+ */
+async function fetchWithRetries(url, signal) {
+  for (let wait = RETRY_MS; !signal.aborted; wait *= 2) {
+    const response = await fetch(url, { signal }).catch(() => null);
+    if (response && !BUSY.includes(response.status)) return response;
+    await new Promise((resolve) => setTimeout(resolve, wait));
+  }
+  return null;
 }
