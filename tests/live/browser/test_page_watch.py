@@ -17,6 +17,20 @@ pytestmark = [
 SIZE = "160x120"
 NO_SEGMENTS = "delete window.MediaSource"
 MOVES = "document.querySelector('#film').currentTime > {}"
+PAUSE_FAR_BEHIND = """new Promise(done => {
+  const film = document.querySelector('#film');
+  const wait = window.setTimeout;
+  const positions = [];
+  window.setTimeout = (...wanted) => {
+    film.pause();
+    const ranges = { length: 1, start: () => 0, end: () => film.currentTime + 100 };
+    Object.defineProperty(SourceBuffer.prototype, 'buffered', { get: () => ranges, configurable: true });
+    positions.push(film.currentTime);
+    if (positions.length === 2) done(positions);
+    return wait(...wanted);
+  };
+})"""
+"""Pauses between two looks at the playlist, as if its end were far ahead; the position before and after the second."""
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +80,9 @@ def test_a_page_shows_what_is_on_air_and_goes_on(on_air, pages, script):
         behind = "const {buffered, currentTime} = document.querySelector('#film'); "
         behind += "return buffered.end(buffered.length - 1) - currentTime"
         assert view.page.evaluate(f"(() => {{ {behind} }})()") < 8
+        if not native:
+            before, after = view.page.evaluate(PAUSE_FAR_BEHIND)
+            assert before == after
 
 
 def test_a_film_that_stands_still_is_begun_anew(on_air, pages):

@@ -60,8 +60,9 @@ export class SegmentPlayer {
     }
   }
 
-  /** Append the new segments of the playlist. */
+  /** Append the new segments of the playlist, unless a picture is paused. */
   async #update() {
+    if (this.video.paused && this.video.currentTime > 0) return;
     const response = await fetchFile(this.url);
     const { init, segments } = parsePlaylist(await response.text(), this.url);
     if (!this.buffer && init) await this.#begin(await fetchBytes(init));
