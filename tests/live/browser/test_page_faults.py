@@ -26,6 +26,15 @@ FILL_TWICE = """async () => {
   return [...pixel];
 }"""
 """Fills the holes of a page without height, then those of a canvas that is one red hole; returns its colour."""
+NOTE_COMPLETED = """async (count) => {
+  const { Assets } = await import('/page/link/assets.js');
+  const assets = new Assets(() => '');
+  for (let time = 0; time < count; time++) {
+    for (const again of [time, 9000]) assets.addCompleted({ time: again, without: [], cameras: [], mesh: true });
+  }
+  return [...assets.completed.keys()];
+}"""
+"""Takes the messages of a live rig whose frames were completed in advance; returns what it remembers."""
 LOSE_GPU = (
     "(async () => { const gl = document.querySelector('#picture').getContext('webgl2');"
     " const e = gl.getExtension('WEBGL_lose_context'); e.loseContext();"
@@ -224,6 +233,15 @@ def test_a_lost_gpu_comes_back_with_the_original(browser, server):
 
 def test_holes_are_filled_after_the_page_had_no_height(desktop):
     assert desktop.page.evaluate(FILL_TWICE) == [255, 0, 0, 255]
+
+
+def test_of_a_rig_that_goes_on_for_hours_the_page_remembers_the_newest_frames(browser, server):
+    page = browser.new_page()
+    page.goto(f"{server.url}page/link/assets.js")
+    names = page.evaluate(NOTE_COMPLETED, 5000)
+    page.close()
+    assert names == [*map(str, range(5000 - len(names) + 1, 5000)), "9000"]
+    assert 64 < len(names) < 2000
 
 
 def test_a_key_that_is_released_while_the_command_key_is_held_does_not_move_the_view_on(desktop):

@@ -37,6 +37,8 @@ const MAX_EXPECTED_MS = 2000;
 const MAX_FAILURES = 3;
 /** A failed frame is requested again after this long, in milliseconds. */
 const RETRY_MS = 1000;
+/** What the server has completed is remembered for this many frames; a live rig goes on for hours. */
+const MAX_COMPLETED = 1000;
 /** The weight of the newest frame in the mean latency. */
 const NEWEST_WEIGHT = 0.2;
 
@@ -355,7 +357,11 @@ export class Assets extends EventTarget {
    * @param {{time: number, without: string[], cameras: any[], mesh: boolean}} message
    */
   addCompleted({ time, without, cameras, mesh }) {
-    this.completed.set(nameFrame(time, without), { cameras, mesh });
+    const name = nameFrame(time, without);
+    this.completed.delete(name); // the newest are at the end
+    this.completed.set(name, { cameras, mesh });
+    const [oldest] = this.completed.keys();
+    if (this.completed.size > MAX_COMPLETED) this.completed.delete(oldest);
     this.dispatchEvent(new CustomEvent("change", { detail: undefined }));
   }
 
