@@ -80,9 +80,11 @@ def test_a_lost_connection_comes_back_with_view_and_time(desktop):
     desktop.settle()
     before, camera = desktop.picture(), desktop.server.looks[-1]["camera"]
     count = len(desktop.server.hellos)
+    desktop.page.locator("#cameras button").first.focus()
     desktop.server.drop()
     desktop.until(lambda: len(desktop.server.hellos) > count)
     desktop.settle()
+    assert desktop.page.evaluate("document.activeElement.textContent") == "cam00"
     assert desktop.server.looks[-1]["camera"] == camera
     assert desktop.data("time") == "9"
     assert np.abs(desktop.picture() - before).mean() < 1

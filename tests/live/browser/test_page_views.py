@@ -12,6 +12,10 @@ def moments(page) -> list[float]:
     return [float(field.input_value()) for field in page.locator("#path-views input").all()]
 
 
+def focused(page) -> str | None:
+    return page.evaluate("document.activeElement.getAttribute('aria-label')")
+
+
 def text(page) -> str:
     return page.locator("#path-text").inner_text()
 
@@ -40,10 +44,13 @@ def test_a_turntable_and_the_order_of_views(desktop):
     field.fill("3")
     field.press("Enter")
     assert moments(page) == [0.0, *(3 + n / 2 for n in range(8))]
+    assert focused(page) == "Seconds of view 2"
     page.get_by_role("button", name="Delete view 1", exact=True).click()
     assert "8 views, 4 s" in text(page) and moments(page)[0] == 0
+    assert focused(page) == "Delete view 1", "what was the second view"
     page.get_by_role("button", name="Move view 1 down", exact=True).click()
     assert moments(page) == [n / 2 for n in range(8)], "the moments stay"
+    assert focused(page) == "Move view 2 down", "it goes along"
     page.get_by_role("button", name="Go to view 2", exact=True).click()
     desktop.settle()
     eye = (
@@ -51,6 +58,10 @@ def test_a_turntable_and_the_order_of_views(desktop):
         @ desktop.server.looks[-1]["camera"]["T"]
     )
     assert np.abs(eye - eyes[15]).max() < 0.05, "what was the second view of the turntable"
+    page.get_by_role("button", name="Move view 7 down", exact=True).press("Enter")
+    assert focused(page) == "Move view 8 up"
+    page.get_by_role("button", name="Delete view 8", exact=True).press("Enter")
+    assert focused(page) == "Delete view 7"
 
 
 def test_a_link_is_copied(desktop):

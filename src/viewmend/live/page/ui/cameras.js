@@ -41,8 +41,16 @@ export class CameraList {
 
   /** @param {any} rig */
   setRig(rig) {
+    const listNames = (/** @type {any[]} */ cameras) => JSON.stringify(cameras.map(({ name }) => name));
+    const isListed = listNames(rig.cameras) === listNames(this.cameras);
     this.cameras = rig.cameras;
-    this.marked = "";
+    if (!isListed) this.#buildButtons();
+    this.#showInputs();
+    this.markUsed([], undefined);
+  }
+
+  /** Build the lists of buttons, which takes the focus from them. */
+  #buildButtons() {
     const buildButton = (/** @type {any} */ camera, /** @type {number} */ index) => {
       const title = `Go to ${camera.name}`;
       const button = element("button", { type: "button", textContent: camera.name, title });
@@ -53,8 +61,6 @@ export class CameraList {
       byId(list).replaceChildren(...this.cameras.map(buildButton));
     }
     for (const label of byId("labels").children) label.tabIndex = -1;
-    this.#showInputs();
-    this.markUsed([], undefined);
   }
 
   /** Leave out the camera that the view is at, or use it again. */

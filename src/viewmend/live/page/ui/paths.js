@@ -206,20 +206,22 @@ export class PathPanel {
     return `${points.length} view${plural}, ${seconds.toFixed(0)} s${limit}`;
   }
 
-  /** List the views that were added, to be sorted, timed and deleted. */
+  /** List the views that were added, to be sorted, timed and deleted. Rows stay, and with them the focus. */
   #listViews() {
     const { points, recordingSince } = this.track;
-    const rows = recordingSince >= 0 ? [] : points.map((point, index) => this.#buildRow(point, index));
-    byId("path-views").replaceChildren(...rows);
-    byId("path-views").hidden = !rows.length;
+    const list = byId("path-views");
+    const count = recordingSince >= 0 ? 0 : points.length;
+    while (list.children.length > count) list.lastElementChild.remove();
+    while (list.children.length < count) list.append(this.#buildRow(list.children.length));
+    for (const [index, row] of [...list.children].entries()) {
+      row.querySelector("input").value = points[index].seconds.toFixed(1);
+      row.querySelector("[aria-label$=down]").disabled = index === count - 1;
+    }
+    list.hidden = !count;
   }
 
-  /**
-   * Build the row of a view.
-   * @param {import("../view/camera_path.js").Point} point
-   * @param {number} index
-   */
-  #buildRow({ pose, seconds }, index) {
+  /** Build the row of a view. @param {number} index */
+  #buildRow(index) {
     const { track } = this;
     const { motion, wake } = this.context;
     const name = `view ${index + 1}`;
@@ -229,36 +231,38 @@ export class PathPanel {
       this.#show();
     };
     const goTo = () => {
-      motion.moveTo(pose);
+      motion.moveTo(track.points[index].pose);
       wake();
     };
     const isFirst = index === 0;
-    const isLast = index === track.points.length - 1;
-    const moment = element("input", {
-      type: "number",
-      min: 0,
-      step: 0.1,
-      value: seconds.toFixed(1),
-      disabled: isFirst,
-    });
+    const moment = element("input", { type: "number", min: 0, step: 0.1, disabled: isFirst });
     moment.setAttribute("aria-label", `Seconds of ${name}`);
     moment.addEventListener(
       "change",
       edit(() => track.retime(index, Number(moment.value))),
     );
-    const moveUp = edit(() => track.move(index, -1));
-    const moveDown = edit(() => track.move(index, 1));
-    const remove = edit(() => track.remove(index));
-    return element(
+    const move = (/** @type {number} */ steps) => {
+      track.move(index, steps);
+      // the focus goes along; at the end of the list, to the button for the way back
+      const buttons = row.parentElement.children[index + steps].querySelectorAll("button:enabled");
+      [...buttons].at(steps < 0 ? 1 : -2).focus();
+    };
+    const remove = () => {
+      track.remove(index);
+      const isLast = row.nextElementSibling === null;
+      if (isLast) (row.previousElementSibling?.lastElementChild ?? byId("path-add")).focus();
+    };
+    const row = element(
       "li",
       {},
       buildButton(String(index + 1), `Go to ${name}`, goTo),
       moment,
       element("span", { textContent: "s" }),
-      buildButton("↑", `Move ${name} up`, moveUp, isFirst),
-      buildButton("↓", `Move ${name} down`, moveDown, isLast),
-      buildButton("✕", `Delete ${name}`, remove),
+      buildButton("↑", `Move ${name} up`, edit(() => move(-1)), isFirst),
+      buildButton("↓", `Move ${name} down`, edit(() => move(1))),
+      buildButton("✕", `Delete ${name}`, edit(remove)),
     );
+    return row;
   }
 
   /** Whether the video shows one frame only. */
