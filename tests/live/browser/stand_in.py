@@ -46,6 +46,8 @@ class Seen:
     live: bool = True
     speed: float = 1.0
     greeted: bool = False
+    silent: bool = False
+    """True is as if the network had gone: nothing is sent, and nothing is heard."""
     acknowledged: int = 0
     sent: int = 0
     answered: tuple = ()
@@ -171,6 +173,8 @@ class StandIn:
 
     async def _hear(self, viewer: Seen, message: dict) -> None:
         kind = message["type"]
+        if viewer.silent:
+            return
         if kind == "hello":
             self.hellos.append(message)
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
@@ -208,7 +212,7 @@ class StandIn:
 
     async def _talk(self, viewer: Seen) -> None:
         last, told = time.monotonic(), 0.0
-        while True:
+        while not viewer.silent:
             now = time.monotonic()
             if viewer.playing:
                 viewer.time = (viewer.time + 10 * viewer.speed * (now - last)) % scene.FRAMES

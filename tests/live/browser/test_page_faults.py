@@ -1,6 +1,7 @@
 """What the page says and does when something is slow, missing or broken."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,20 @@ def test_a_lost_connection_comes_back_with_view_and_time(desktop):
     assert desktop.data("time") == "9"
     assert np.abs(desktop.picture() - before).mean() < 1
     assert cover(desktop) == ""
+
+
+def test_a_connection_that_broke_without_a_close_is_restored(browser, server):
+    worker = server.files["link/worker.js"]
+    impatient = worker.content.replace(b"PING_MS = 5000", b"PING_MS = 300")
+    server.files["link/worker.js"] = replace(worker, content=impatient)
+    with opened(browser, server) as view:
+        view.settle()
+        count = len(server.hellos)
+        for viewer in server.viewers:
+            viewer.silent = True
+        view.until(lambda: len(server.hellos) > count)
+        view.drag(60, 0)
+        view.settle()
 
 
 def test_a_page_that_repaints_slowly_gets_no_more_pictures_than_it_takes(browser, server):

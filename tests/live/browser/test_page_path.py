@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from live.browser import scene
+from live.browser.conftest import SCREENSHOT_S
 
 from viewmend.data.camera_path import read_camera_path
 from viewmend.studio.rigs import orbit
@@ -21,7 +22,7 @@ def eye(camera: dict) -> np.ndarray:
 
 def export(view, tmp_path) -> tuple[dict, list[np.ndarray]]:
     """Press the button; what was posted and the film's frames."""
-    with view.page.expect_download(timeout=60_000) as waiting:
+    with view.page.expect_download(timeout=1000 * SCREENSHOT_S) as waiting:
         view.page.get_by_role("button", name="Export MP4").click()
     path = tmp_path / waiting.value.suggested_filename
     waiting.value.save_as(path)

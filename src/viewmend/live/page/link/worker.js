@@ -14,6 +14,13 @@ import { buildSurface } from "../draw/surface.js";
  *   | {undecodable: string}} Report
  */
 
+/** The server is asked for a sign of life at this interval, in milliseconds. */
+const PING_MS = 5000;
+/** After this many requests without any message of the server, the connection counts as broken. */
+const MAX_UNANSWERED = 3;
+/** WebSocket's close code of a connection that broke. */
+const ABNORMAL_CLOSURE = 1006;
+
 /** @type {WebSocket | null} */
 let socket = null;
 let decoder = new PictureDecoder();
@@ -37,16 +44,32 @@ function open(url) {
   decoder = new PictureDecoder();
   untaken = 0;
   acknowledgeNext = null;
-  own.onopen = () => post({ opened: true });
-  own.onmessage = ({ data }) => {
-    if (socket !== own) return;
-    if (typeof data === "string") post({ text: data });
-    else receiveFrame(own, data);
-  };
-  own.onclose = ({ code, reason }) => {
+  let unanswered = 0;
+  let timer = 0;
+  const end = (/** @type {{code: number, reason: string}} */ { code, reason }) => {
+    clearInterval(timer);
     if (socket !== own) return;
     socket = null;
     post({ closed: { code, reason } });
+  };
+  // without a close, the browser notices a broken connection after many minutes
+  const ping = () => {
+    if (unanswered === MAX_UNANSWERED) {
+      end({ code: ABNORMAL_CLOSURE, reason: "" });
+      own.close();
+    } else if (own.readyState === WebSocket.OPEN) {
+      unanswered += 1;
+      own.send(JSON.stringify({ type: "ping", sent_ms: performance.now() }));
+    }
+  };
+  own.onopen = () => post({ opened: true });
+  own.onclose = end;
+  own.onmessage = ({ data }) => {
+    if (socket !== own) return;
+    unanswered = 0;
+    timer ||= setInterval(ping, PING_MS); // not before the page's hello
+    if (typeof data === "string") post({ text: data });
+    else receiveFrame(own, data);
   };
 }
 
