@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from live.browser.conftest import SCREENSHOT_S, opened
-from live.live_servers import CAMERAS, PIPELINE, get
+from live.browser.test_page_completed_ahead import Green
+from live.browser.test_page_drawing import silent
+from live.live_servers import CAMERAS, PIPELINE, get, running
 from reference.ball import BallCapture
 
 from viewmend import serve
@@ -98,6 +100,27 @@ def test_two_models_are_compared(browser, ball):
         assert session.wanted_look.model == "paper-small"
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         assert texts(view, "right-name") == ["Completed (paper-small)"] and ball.service.error is None
+
+
+def test_until_another_result_arrives_the_drawn_view_is_shown(browser):
+    def are_green(view) -> list[bool]:
+        """Whether each half of the view is."""
+        halves = [half[half.max(-1) > 60] for half in np.array_split(view.picture(), 2, axis=1)]
+        return [(half[:, 1] - half[:, [0, 2]].max(-1) > 120).sum() > 0.5 * len(half) for half in halves]
+
+    query = "?time=0&panel=0&mode=split&left=completed&right=compared:paper-small"
+    with running(inpainter=Green()) as server, opened(browser, server, query=query) as view:
+        server.service.renderer._models["paper-small"] = Green()
+        view.until(lambda: are_green(view) == [True, True], SCREENSHOT_S)
+        (session,) = server.live.registry.sessions
+        with silent(server):
+            view.page.locator("#quality").evaluate("e => (e.value = 1, e.dispatchEvent(new Event('input')))")
+            view.until(lambda: session.wanted_look.top_k is not None, SCREENSHOT_S)
+            assert are_green(view) == [True, True], "another context is nearly the same"
+            view.page.locator("#split-right").select_option("compared:rays", force=True)
+            view.until(lambda: are_green(view) == [True, False], SCREENSHOT_S)
+            view.page.locator("#error-rule").select_option("all", force=True)
+            view.until(lambda: are_green(view) == [False, False], SCREENSHOT_S)
 
 
 def test_depth_and_errors_have_a_scale(browser, ball):

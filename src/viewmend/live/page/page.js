@@ -444,6 +444,7 @@ class Page {
       ...(drawing ? { full: true, depth: false } : {}),
     };
     if (this.link.requestView(request)) {
+      this.stage.expect(this.link.requestCount, request);
       if (!drawing) this.notices.markRequested();
       if (!moving && !playing) this.refining.begin();
     }

@@ -86,6 +86,8 @@ export class Stage {
     if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
     this.gl = gl;
     this.background = [0, 0, 0];
+    /** The last requested result, and its first request: of the view, and of the one by another model. */
+    this.expected = { view: "", since: 0, model: /** @type {string | null} */ (null), comparedSince: 0 };
     this.prepare();
   }
 
@@ -107,6 +109,20 @@ export class Stage {
     /** When the server's last image arrived, in milliseconds, and the opacity that it was last drawn with. */
     this.lastImage = { arrivedAt: -Infinity, opacity: 0 };
     this.lines = new LinePainter(this.gl);
+  }
+
+  /**
+   * Take note of a request: the image of another result than the requested one is not shown over a frame.
+   * @param {number} id
+   * @param {{without: string[], error_rule: string | null, background: string, model: string | null}} request
+   */
+  expect(id, { without, error_rule, background, model }) {
+    const { expected } = this;
+    const view = JSON.stringify([without, error_rule, background]);
+    if (view !== expected.view) expected.since = id;
+    if (model !== expected.model) expected.comparedSince = id;
+    expected.view = view;
+    expected.model = model;
   }
 
   /** Upload a frame of the server; its images are closed. @param {Shown} shown */
@@ -230,8 +246,10 @@ export class Stage {
     this.scene.prepare(frame, position, modes);
     const cutOuts = options.rig ? this.scene.buildCutOuts(frame) : [];
     const eyeImages = this.eyes[Math.min(eye, this.eyes.length - 1)];
-    const opacity = this.#computeOpacity(viewer, frame, eye);
-    this.lastImage.opacity = opacity;
+    const opacities = modes.map((mode) => {
+      return eyeImages?.modes.includes(mode) ? this.#computeOpacity(viewer, frame, eye, mode) : 0;
+    });
+    this.lastImage.opacity = Math.max(...opacities);
     gl.viewport(x, y, width, height);
     gl.enable(gl.SCISSOR_TEST);
     gl.enable(gl.DEPTH_TEST);
@@ -251,7 +269,7 @@ export class Stage {
         this.#drawPhoto(viewer, mode);
         return;
       }
-      const imageOpacity = eyeImages?.modes.includes(mode) ? opacity : 0;
+      const imageOpacity = opacities[index];
       if (imageOpacity < 1 || options.rig) {
         this.scene.draw(frame, viewer, position, mode, viewport, this.background);
       }
@@ -273,14 +291,16 @@ export class Stage {
   }
 
   /**
-   * Compute the opacity of the server's image over a drawn frame; 0 if the image shows another view.
+   * Compute the opacity of the server's image over a drawn frame; 0 if it shows another view or result.
    * @param {Viewpoint} viewer
    * @param {import("../link/assets.js").Frame} frame
    * @param {number} eye
+   * @param {string} mode
    */
-  #computeOpacity(viewer, frame, eye) {
-    const { header } = this;
-    if (!header || !this.eyes.length || header.time !== frame.time) return 0;
+  #computeOpacity(viewer, frame, eye, mode) {
+    const { header, expected } = this;
+    if (!header || header.time !== frame.time || header.look < expected.since) return 0;
+    if (mode === "compared" && header.look < expected.comparedSince) return 0;
     const camera = header.cameras[Math.min(eye, header.cameras.length - 1)];
     if (!isSameView(camera, header.width, header.height, viewer)) return 0;
     return Math.min(1, Math.max(MIN_OPACITY, (performance.now() - this.lastImage.arrivedAt) / FADE_MS));
