@@ -100,6 +100,7 @@ def test_characters_act_wherever_the_keyboard_has_them(browser, desktop):
         return float(np.linalg.norm(np.reshape(camera["R"], (3, 3)) @ scene.CENTER + camera["T"]))
 
     before = distance()
+    desktop.until(f"document.querySelector('#seek').max === '{scene.FRAMES - 1}'")  # it has a clock
     send("keydown", "?", "Minus")
     assert page.get_by_role("dialog").is_visible()
     page.get_by_role("button", name="Close the help").click()
