@@ -103,6 +103,19 @@ def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame
     assert ["**" in row[grid.heads.index("LPIPS whole")] for row in grid.rows] == [False, True, False]
 
 
+def test_a_method_that_failed_on_some_scenes_is_never_the_best(make_cell, make_frame):
+    scores = {"telea": (20.0, 22.0), "nearest": (19.0, 21.0), "own": (30.0, None)}
+    cells = [
+        make_cell(f"s{n}", method, "A", [make_frame(psnr_holes=db)] if db else [], None if db else "broke")
+        for method, both in scores.items()
+        for n, db in enumerate(both)
+    ]
+    table = make_report(cells, tuple(scores), RunSettings()).tables[0]
+    grid = main_grid(table)
+    assert [row[grid.heads.index("holes, dB")] for row in grid.rows] == ["**21.00**", "20.00", "30.00"]
+    assert "over the other scenes, and never marked: own (1 of 2 scenes)." in holes_line(table)
+
+
 def test_the_page_is_self_contained_and_has_all_images(evaluated):
     report, cells, store = evaluated
     shown = page(report, store)

@@ -266,7 +266,7 @@ def background_lines(report: Report) -> list[str]:
 
 
 def holes_line(table: Table) -> str:
-    """The number of frames, and the size of their holes."""
+    """The number of frames, the size of their holes, and the methods whose means leave out scenes."""
     sizes = " and ".join(f"{width} x {height}" for width, height in table.sizes_px)
     of_hull, of_image, of_surface = (
         next((v for row in table.rows if (v := row.scores.mean("hole_fraction", of)) is not None), None)
@@ -286,8 +286,17 @@ def holes_line(table: Table) -> str:
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
         f"{number(of_image, 100, 3)} % of the image{past}. Frames with too few hole pixels to be scored there: "
-        f"{table.thin_frames}; {table.empty_frames} of them have none.{composition}{advice}"
+        f"{table.thin_frames}; {table.empty_frames} of them have none.{composition}{advice}{_failures(table)}"
     )
+
+
+def _failures(table: Table) -> str:
+    """The methods that failed on some scenes; "" if there are none."""
+    over = [
+        f"{row.method} ({row.scenes - row.failed} of {row.scenes} scenes)" for row in table.rows if row.failed
+    ]
+    text = f" Means of methods that failed are over the other scenes, and never marked: {', '.join(over)}."
+    return printable(text) if over else ""
 
 
 def _composition_line(table: Table) -> str:
@@ -330,11 +339,16 @@ def _without_empty_columns(grid: Grid) -> Grid:
 
 def _best(rows: Sequence[Row], column: Column) -> float | None:
     """The best mean of a column, as shown; None if it has no best, or all are equal."""
-    means = (row.scores.mean(column.metric, column.region) for row in rows if row.method not in PRIVILEGED)
+    means = (row.scores.mean(column.metric, column.region) for row in rows if _can_be_best(row))
     values = {round(column.factor * value, column.digits) for value in means if value is not None}
     if len(values) < 2 or column.best is None:
         return None
     return max(values) if column.best == "largest" else min(values)
+
+
+def _can_be_best(row: Row) -> bool:
+    """Whether its means compare with those of others: it is not given the truth, and completed the same scenes."""
+    return row.method not in PRIVILEGED and not row.failed
 
 
 def _score_cell(row: Row, column: Column, best: float | None) -> str:
@@ -345,7 +359,7 @@ def _score_cell(row: Row, column: Column, best: float | None) -> str:
     if error is not None:
         text += f" ± {column.factor * error:.{column.digits}f}"
     is_best = best is not None and mean is not None and round(column.factor * mean, column.digits) == best
-    return f"**{text}**" if is_best and row.method not in PRIVILEGED else text
+    return f"**{text}**" if is_best and _can_be_best(row) else text
 
 
 def readings_grid(table: Table) -> Grid:
