@@ -18,12 +18,15 @@ from viewmend.evaluation.report import (
     markdown,
     report_csv,
     report_json,
+    setting_lines,
     summary,
 )
 from viewmend.evaluation.report_page import largest_hole, page, write_sheets
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import StreamConfig
 from viewmend.utils.contact_sheet import BACKGROUND, GAP_PX, LABEL_PX
 
 METHODS = ("telea", "unfilled", "dstt-o-def")
@@ -69,6 +72,28 @@ def test_a_model_made_for_another_background_is_named(evaluated):
         report = make_report(cells, ("telea", "paper-small"), RunSettings(background=background))
         for text in map(markdown, (summary(report), blocks(report))):
             assert ("another background, so they score lower on black: paper-small (white)" in text) == said
+
+
+def test_every_setting_of_the_cells_is_stated(evaluated):
+    _, cells, _ = evaluated
+    render = RenderConfig(error_rule="predicted", refine_fraction=0.25)
+    stream = StreamConfig(geometry="fused", render=render, memory_mb=None)
+    settings = RunSettings(stream=stream, top_k=64, precision="bfloat16")
+    report = make_report(
+        cells, METHODS[:2], settings, preparation={"align": False, "match_colours": True, "tighten_masks": False}
+    )
+    (line,) = setting_lines(report)
+    for said in (
+        "cpu, bfloat16;",
+        "geometry fused;",
+        "error rule predicted, up to 0.25 of the subject;",
+        "64 context tokens;",
+        "captures read with --no-align, --no-tighten-masks.",
+    ):
+        assert said in line
+    assert json.loads(report_json(report))["settings"]["preparation"]["align"] is False
+    (usual,) = setting_lines(make_report(cells, METHODS[:2], RunSettings()))
+    assert "bfloat16 for models trained in it" in usual and "context tokens" not in usual
 
 
 def test_failures_and_missing_methods_are_in_every_format(evaluated):

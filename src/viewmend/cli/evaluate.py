@@ -200,7 +200,9 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
             say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
     order = {key: n for n, key in enumerate((s.name, m) for s in scenes for m in names)}
     cells.sort(key=lambda cell: order[cell.key.scene, cell.key.method])
-    report = make_report(cells, names, settings, missing, missing_networks)
+    report = make_report(
+        cells, names, settings, missing, missing_networks, preparation=asdict(options.preparation)
+    )
     _write(options, report, store)
     return report
 

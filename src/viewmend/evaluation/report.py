@@ -197,6 +197,8 @@ class Report:
     """Networks of metrics without weights, with the reason: their scores are n/a."""
     origins: tuple[Provenance, ...]
     """Where the cells were computed: several if a run was resumed."""
+    preparation: Mapping[str, bool] = field(default_factory=dict)
+    """What is corrected in captures (`data.prepare.prepare`), by its name."""
 
 
 def make_report(
@@ -205,6 +207,7 @@ def make_report(
     settings: RunSettings,
     missing: dict[str, str] | None = None,
     missing_networks: dict[str, str] | None = None,
+    preparation: Mapping[str, bool] | None = None,
 ) -> Report:
     """Average the cells; rows and scenes keep the order of `methods` and `cells`."""
     return Report(
@@ -218,6 +221,7 @@ def make_report(
         missing=missing or {},
         missing_networks=missing_networks or {},
         origins=tuple(dict.fromkeys(cell.provenance for cell in cells)),
+        preparation=preparation or {},
     )
 
 
@@ -239,12 +243,28 @@ def setting_lines(report: Report) -> list[str]:
     """The settings of the evaluation."""
     settings = report.settings
     render = report.settings.stream.render
-    lines = [
-        f"Protocol {settings.protocol}; version {report.protocol} of the scores; {settings.device}, "
-        f"{settings.precision}; {render.cameras} source cameras by {render.selection}; error rule "
-        f"{render.error_rule or 'of each method'}; SSIM {settings.ssim}; scored on {settings.background}."
+    precision = settings.precision
+    if precision == "auto":
+        precision = "bfloat16 for models trained in it, if the device has units for it, otherwise float32"
+    rule = render.error_rule or "of each method"
+    if rule == "predicted":
+        rule += f", up to {render.refine_fraction:.4g} of the subject"
+    parts = [
+        f"Protocol {settings.protocol}",
+        f"version {report.protocol} of the scores",
+        f"{settings.device}, {precision}",
+        f"geometry {settings.stream.geometry}",
+        f"{render.cameras} source cameras by {render.selection}",
+        f"error rule {rule}",
+        f"SSIM {settings.ssim}",
+        f"scored on {settings.background}",
     ]
-    return [*lines, *background_lines(report)]
+    if settings.top_k is not None:
+        parts.append(f"{settings.top_k} context tokens")
+    omitted = [f"--no-{name.replace('_', '-')}" for name, done in report.preparation.items() if not done]
+    if omitted:
+        parts.append(f"captures read with {', '.join(omitted)}")
+    return [f"{'; '.join(parts)}.", *background_lines(report)]
 
 
 def origin_lines(report: Report) -> list[str]:
@@ -465,7 +485,7 @@ def report_json(report: Report) -> str:
     same = {name: getattr(report, name) for name in ("methods", "identities", "missing", "missing_networks")}
     value = {
         **{"protocol": report.settings.protocol, "version": report.protocol, "rules": RULES},
-        **{"settings": asdict(report.settings), **same},
+        **{"settings": asdict(report.settings) | {"preparation": dict(report.preparation)}, **same},
         "origins": [asdict(origin) for origin in report.origins],
         "tables": [_table_values(table) for table in report.tables],
         "cells": [_cell_values(cell, report.scores) for cell in report.cells],
