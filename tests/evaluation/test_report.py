@@ -59,6 +59,7 @@ def test_every_format_has_the_same_figures(evaluated):
             assert (
                 f"{own['psnr_holes']:.2f}" in text and f"{own['ssim_holes']:.5f}" in text and cell["fps"] > 0
             )
+    assert all(cell["jobs"] == 1 and cell["threads"] and cell["device"] for cell in value["cells"])
     assert len(value["cells"]) == 4 and {line["method"] for line in lines} == {"telea", "unfilled"}
     assert [value["cells"][0]["psnr_holes"]] == [np.mean([f.psnr_holes for f in cells[0].frames])]
     rows = {row["method"]: row["scores"]["psnr_holes"] for row in value["tables"][1]["rows"][:2]}

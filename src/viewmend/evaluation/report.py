@@ -526,7 +526,7 @@ def _cell_values(cell: Cell, scores: Records) -> dict[str, object]:
         "frames": len(cell.frames),
         "thin_frames": len(cell.frames) - len(frames_with_holes(cell.frames)),
         "empty_frames": sum(frame.hole_px == 0 for frame in cell.frames),
-        "commit": cell.provenance.commit,
+        **{name: getattr(cell.provenance, name) for name in ("commit", "device", "jobs", "threads")},
         "file": f"{cell.key.stem}.json",
     }
 
