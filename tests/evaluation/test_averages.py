@@ -132,6 +132,17 @@ def test_the_standard_error_is_over_scenes(make_cell, make_frame):
     assert records(cells[:2]).standard_error("psnr", "holes") is None
 
 
+def test_the_mean_of_several_sets_has_no_standard_error(make_cell, make_frame):
+    cells = [
+        make_cell(f"{name}{n}", "telea", name, [make_frame(psnr_holes=db + n)])
+        for name, db in {"A": 10.0, "B": 20.0, "C": 30.0}.items()
+        for n in range(3)
+    ]
+    overall, *per_set = (table.rows[0].scores for table in tables(cells, ("telea",)))
+    assert [own.standard_error("psnr", "holes") for own in per_set] == pytest.approx([3**-0.5] * 3)
+    assert overall.mean("psnr", "holes") == 21 and overall.standard_error("psnr", "holes") is None
+
+
 def test_speed_covers_frames_with_holes(make_cell, make_frame):
     frames = [make_frame() for _ in range(100)] + [make_frame(hole_px=0)]
     taken = speed([make_cell("s", "telea", "A", frames, step_ms=[*map(float, range(1, 101)), 1e9])])
