@@ -17,6 +17,7 @@ from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView
+from viewmend.utils.timing import StageTimes
 
 TARGET = camera_at(75, "t", height_m=0.3)
 
@@ -63,6 +64,14 @@ def test_a_model_that_paints_on_white_is_scored_on_white(snow):
     summary = MendSummary()
     summary.add(step)
     assert summary.as_json()["background"] == "white"
+
+
+def test_the_time_of_a_stage_is_over_the_views_in_which_it_ran(snow):
+    step, _ = snow
+    summary = MendSummary()
+    for geometry in (80.0, 0.0, 0.0, 90.0, 0.0):  # two frames, of three views and of two
+        summary.add(replace(step, times=StageTimes(geometry=geometry, rendering=2.0)))
+    assert summary.stage_ms() == {"geometry": 85.0, "context": 0.0, "rendering": 2.0, "inpainting": 0.0}
 
 
 def test_a_model_that_paints_on_white_is_shown_on_white(snow, tmp_path):

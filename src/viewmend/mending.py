@@ -200,9 +200,10 @@ class MendSummary:
         return mean_over_frames([getattr(s, metric) for s in scores], pixels.get(metric))
 
     def stage_ms(self) -> dict[str, float]:
-        """Median milliseconds of each stage."""
+        """Median milliseconds of each stage over the views in which it ran: several may share a frame's geometry."""
         times = [asdict(stages) for stages in self._times]
-        return {stage: median(t[stage] for t in times) for stage in times[0]} if times else {}
+        stages = times[0] if times else ()
+        return {stage: median([t[stage] for t in times if t[stage]] or [0.0]) for stage in stages}
 
 
 def _input_iou(cached: CachedFrame) -> dict[str, float]:
