@@ -6,7 +6,7 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at, ring
 
-from viewmend.cli.mend_output import MendOutput, sheet_row
+from viewmend.cli.mend_output import MendOutput, as_text, sheet_row
 from viewmend.data.images import read_rgb
 from viewmend.mending import Mender, MendSummary
 from viewmend.metrics.image_quality import psnr, ssim_map
@@ -64,6 +64,9 @@ def test_a_model_that_paints_on_white_is_scored_on_white(snow):
     summary = MendSummary()
     summary.add(step)
     assert summary.as_json()["background"] == "white"
+    assert "views are scored" not in "\n".join(as_text(summary))
+    summary.add(replace(step, truth=None, scores=None))
+    assert "; 1 of 2 views are scored" in "\n".join(as_text(summary))
 
 
 def test_the_time_of_a_stage_is_over_the_views_in_which_it_ran(snow):

@@ -164,6 +164,11 @@ class MendSummary:
         self._times.append(step.times)
 
     @property
+    def scored_frames(self) -> int:
+        """Number of views that the scores are means of: those with a truth and a subject."""
+        return len(self._scores)
+
+    @property
     def hole_fraction(self) -> float | None:
         """Fraction of the hull's pixels that are holes; None without a hull."""
         return self._hole_px / self._hull_px if self._hull_px else None
@@ -175,7 +180,7 @@ class MendSummary:
 
     def as_json(self) -> dict[str, object]:
         """The scores of `mend --json`; None where there are no such pixels, or no truth. Times are medians in ms."""
-        whole = ("frames", "protocol", "background", "hole_fraction", "completed_fraction")
+        whole = ("frames", "scored_frames", "protocol", "background", "hole_fraction", "completed_fraction")
         return {
             **{name: getattr(self, name) for name in whole},
             "psnr_whole": self.mean("ours", "psnr_whole"),

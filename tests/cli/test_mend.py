@@ -30,10 +30,10 @@ from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import picture
 
 KEYS = [
-    "frames", "protocol", "background", "hole_fraction", "completed_fraction", "psnr_whole", "psnr_whole_rendered",
-    "ssim_whole", "lpips_whole", "lpips_whole_rendered", "lpips_subject", "psnr_subject", "alpha_iou",
-    "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou",
-    "stage_ms",
+    "frames", "scored_frames", "protocol", "background", "hole_fraction", "completed_fraction",
+    "psnr_whole", "psnr_whole_rendered", "ssim_whole", "lpips_whole", "lpips_whole_rendered",
+    "lpips_subject", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes", "psnr_holes_telea",
+    "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou", "stage_ms",
 ]  # fmt: skip
 
 
@@ -43,7 +43,7 @@ TELLS_ALL = f"{tells_all.__file__}:TellsAll"
 def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, mend):
     code, report, _ = mend(folder, tmp_path / "out", "--leave-out", "held")
     assert code == 0 and list(report) == KEYS
-    assert report["frames"] == 2
+    assert report["frames"] == report["scored_frames"] == 2
     assert report["psnr_valid"] > 19 and report["psnr_whole"] > 21  # the hull of six views is fat
     assert report["psnr_holes"] == report["psnr_holes_telea"]
     assert list(report["hull_iou"]) == ["c0", "c1", "c2", "c3", "c4", "c5", "held"]
@@ -135,8 +135,9 @@ def test_frames_in_which_the_camera_left_out_is_absent_have_no_true_view(folder,
     source = shutil.copytree(folder, tmp_path / "gap")
     (first, *_) = sorted((source / "image" / "held").iterdir())
     first.unlink()
-    code, report, _ = mend(source, tmp_path / "out", "--leave-out", "held", "--frames", "0:2")
-    assert code == 0 and report["frames"] == 2
+    code, report, said = mend(source, tmp_path / "out", "--leave-out", "held", "--frames", "0:2")
+    assert code == 0 and report["frames"] == 2 and report["scored_frames"] == 1
+    assert "1 of 2 views have no usable image of 'held': they are made without its mask" in said
     assert [file.name for file in (tmp_path / "out/true").iterdir()] == ["000001.png"]
     with av.open(str(tmp_path / "out/compared.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 2

@@ -175,6 +175,7 @@ def _mend_views(
     frames = prefetch(capture, [time for time, _ in groupby(plan_times)])
     frame = None
     skipped: set[int] = set()
+    num_unseen = 0
     trimmer = HeapTrimmer()
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
@@ -189,6 +190,7 @@ def _mend_views(
                 continue
             has_truth = any(name in frame.cameras.names for name in held)
             truth = frame.select(held) if has_truth else None
+            num_unseen += bool(held) and truth is None
             step = mender.mend(inputs, target.to(options.device), truth)
             summary.add(step)
             output.add(step)
@@ -199,6 +201,9 @@ def _mend_views(
         count = f"{len(skipped)} of {len(set(plan_times))} frames"
         first = capture.frame_ids[min(skipped)]
         say(f"{count} have fewer than two usable input cameras and were skipped; the first is '{first}'")
+    if num_unseen:
+        count = f"{num_unseen} of {summary.frames} views"
+        say(f"{count} have no usable image of '{held[0]}': they are made without its mask, and not scored")
 
 
 def _report(

@@ -197,10 +197,12 @@ def as_text(summary: MendSummary) -> list[str]:
     ]
     if summary.mean("ours", "psnr_whole") is None:
         return lines
+    scored = summary.scored_frames
+    over = f"; {scored} of {summary.frames} views are scored" if scored < summary.frames else ""
     whole = in_db(summary.mean("ours", "psnr_whole"))
     whole_rendered = in_db(summary.mean("unfilled", "psnr_whole"))
     lines += [
-        f"PSNR on {summary.background}, dB; protocol {summary.protocol}",
+        f"PSNR on {summary.background}, dB; protocol {summary.protocol}{over}",
         f"  whole image           {whole}   rendered {whole_rendered}",
         f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}",
         f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}",
