@@ -50,11 +50,11 @@ class Options:
     against them. PSNR, in dB, is given for the whole image, for the subject (inside the true mask),
     for pixels that a camera colours ("valid"), for holes, and for holes inside the true mask
     ("fg"). For comparison, it is also given for the whole image as rendered, and for holes that
-    OpenCV's Telea fills. SSIM is given for the whole image, LPIPS (AlexNet) for the whole image and
-    for the subject. IoU compares alpha with the true mask. All scores are means over frames. A
-    score of holes skips frames in which it covers fewer than 50 pixels, unless all frames have
-    fewer. hole_fraction is the fraction of the hull's pixels that are holes, completed_fraction the
-    fraction that is completed.
+    OpenCV's Telea fills. LPIPS (AlexNet) is given for the whole image and for the subject; with
+    --json, also SSIM for the whole image, and the IoU of alpha and the true mask. All scores are
+    means over frames. A score of holes skips frames in which it covers fewer than 50 pixels, unless
+    all frames have fewer. hole_fraction is the fraction of the hull's pixels that are holes,
+    completed_fraction the fraction that is completed.
 
     Images are composited on black for output and scores, or on white if the model was trained on
     white (paper-small).
