@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3")), "sheets/*.png")
 """Files in OUT besides cells."""
 LONG_SETS = ("P-long", "Q-long", "P-turn")
+SYNTHETIC_SETS = ("P", "Q", *LONG_SETS, "R48", "R34")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,6 +165,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1, top_k=1)
     if not sets:
         raise ValueError("expected at least one set, got no set; P needs no data")
+    _check_used(options, sets)
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(
             f"{options.out}: expected a folder for the results, got a file; choose another --out"
@@ -205,6 +207,27 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     )
     _write(options, report, store)
     return report
+
+
+def _check_used(options: RunOptions, sets: tuple[str, ...]) -> None:
+    """Raise a ValueError for an option that none of the sets uses, or for a background that one of them lacks."""
+    captures = [name for name in sets if name not in SYNTHETIC_SETS]
+    people = [name for name in sets if name in SYNTHETIC_SETS and name[0] in "QR"]
+    default = RunOptions(out=options.out)
+    used = {
+        "background": set(sets) <= {"P", "P-long"},
+        "size": len(captures) < len(sets),
+        **dict.fromkeys(("performers", "motions"), bool(people)),
+        **dict.fromkeys(("format", "inputs", *vars(default.preparation)), bool(captures)),
+    }
+    given = vars(options) | vars(options.preparation)
+    usual = vars(default) | vars(default.preparation)
+    for name, is_used in used.items():
+        if given[name] != usual[name] and not is_used:
+            option = f"--{'no-' if given[name] is False else ''}{name.replace('_', '-')}"
+            raise ValueError(
+                f"expected sets that {option} can change, got {', '.join(sets)}; leave it out, or see --help"
+            )
 
 
 def _write(options: RunOptions, report: "Report", store: "CellStore") -> None:
