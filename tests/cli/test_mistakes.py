@@ -73,6 +73,8 @@ MISTAKES = {
         "--broadcast 1280x14": "from 16",
         "--broadcast 4096x4096": "2048",
         "--broadcast 1280x720 --ray local": "--broadcast or --ray",
+        "live --max-image-size 512": "expected neither --max-image-size nor",
+        "live --no-align": "whose frames are used as they are pushed",
     },
     "train": {
         "smal": "expected a recipe among",

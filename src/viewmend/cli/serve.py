@@ -159,6 +159,12 @@ def _check(options: Options) -> None:
             raise ValueError(f"--{name.replace('_', '-')} must be {limit}, got {getattr(options, name)}")
     if options.broadcast is not None and options.ray is not None:
         raise ValueError("expected --broadcast or --ray, got both; --broadcast needs a server of one process")
+    as_read = (Options.max_image_size, PreparationOptions())
+    if options.source == "live" and (options.max_image_size, options.preparation) != as_read:
+        raise ValueError(
+            "expected neither --max-image-size nor --no-align, --no-match-colours or --no-tighten-masks with live, "
+            "whose frames are used as they are pushed; leave it out"
+        )
     if options.ray is not None and options.source == "live":
         raise ValueError(
             "expected a capture, rig.toml or studio with --ray, got live: a rig would push to one process only; "
