@@ -50,7 +50,7 @@ def summarise(taken_ms: Sequence[float]) -> dict[str, float]:
 def machine(device: str) -> dict[str, object]:
     """The machine, its load, and the versions of Python, torch and this repository."""
     return {
-        "device": torch.cuda.get_device_name() if device.startswith("cuda") else processor(),
+        "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else processor(),
         "threads": torch.get_num_threads(),
         "load_average": round(os.getloadavg()[0], 1),
         "python": platform.python_version(),
@@ -72,7 +72,7 @@ def write(what: str, device: str, config: object, results: object) -> Path:
 def synchronise(device: str) -> None:
     """Wait for pending work on a GPU."""
     if device.startswith("cuda"):
-        torch.cuda.synchronize()
+        torch.cuda.synchronize(device)
 
 
 def processor() -> str:

@@ -94,7 +94,7 @@ class Clocked:
         self.network, self.seconds, self.check_size = network, 0.0, network.check_size
 
     def complete_clip(self, clip: Clip) -> Tensor:
-        return self._timed(lambda: self.network.complete_clip(clip), clip.now.device.type)
+        return self._timed(lambda: self.network.complete_clip(clip), str(clip.now.device))
 
     def take_s(self) -> float:
         """Seconds since the last call."""
