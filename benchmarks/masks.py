@@ -1,4 +1,7 @@
-"""IoU of masks from `viewmend masks` with a capture's own: python benchmarks/masks.py CAPTURE MASKED."""
+"""IoU of masks from `viewmend masks` with a capture's own: python benchmarks/masks.py CAPTURE MASKED.
+
+Images whose camera is absent from CAPTURE, and those without a subject in either mask, are left out.
+"""
 
 import argparse
 import json
@@ -7,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from viewmend.data.capture_folder import open_capture
+from viewmend.metrics.image_quality import mask_iou
+from viewmend.types import MultiViewFrame
 
 
 def main() -> None:
@@ -19,12 +24,8 @@ def main() -> None:
     scores: dict[str, list[float]] = {}
     for time, frame_id in enumerate(made.frame_ids):
         found, right = made.read(time), truth.read(truth.frame_ids.index(frame_id))
-        assert found.mask is not None and right.mask is not None
-        for view, name in enumerate(found.cameras.names):
-            width, height = found.cameras.size_px[view].tolist()
-            a = found.mask[view, :height, :width].numpy() > 127
-            b = right.mask[right.cameras.names.index(name), :height, :width].numpy() > 127
-            scores.setdefault(name, []).append(float((a & b).sum() / max((a | b).sum(), 1)))
+        for name, score in overlaps(found, right).items():
+            scores.setdefault(name, []).append(score)
     means = {name: round(float(np.mean(own)), 3) for name, own in scores.items()}
     lowest = round(min(min(own) for own in scores.values()), 3)
     print(
@@ -32,6 +33,20 @@ def main() -> None:
             {"mean": round(float(np.mean(list(means.values()))), 3), "lowest": lowest, "cameras": means}
         )
     )
+
+
+def overlaps(found: MultiViewFrame, right: MultiViewFrame) -> dict[str, float]:
+    """IoU of the masks of each camera that both frames have; none where both masks are empty."""
+    scores = {}
+    for name in found.cameras.names:
+        if name in right.cameras.names:
+            a, b = found.select([name]), right.select([name])
+            assert a.mask is not None and b.mask is not None
+            width, height = a.cameras.max_size_px
+            score = mask_iou(*(own.mask[0, :height, :width] > 127 for own in (a, b)))
+            if score is not None:
+                scores[name] = score
+    return scores
 
 
 if __name__ == "__main__":
