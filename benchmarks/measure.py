@@ -1,5 +1,6 @@
 """Timing (warm-up, synchronisation, median and 95th percentile) and result files, shared by all benchmarks."""
 
+import itertools
 import json
 import os
 import platform
@@ -60,13 +61,22 @@ def machine(device: str) -> dict[str, object]:
 
 
 def write(what: str, device: str, config: object, results: object) -> Path:
-    """Write results/<what>--<device>--<date>.json with everything that the figures depend on; return its path."""
+    """Write the results to `result_file` with everything that the figures depend on; return its path."""
+    path = result_file(what, device, config)
     today = date.today().isoformat()
     entry = {"what": what, "date": today, **machine(device), "config": config, "results": results}
     RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{what}--{device.split(':')[0]}--{today}.json"
     path.write_text(json.dumps(entry, indent=2) + "\n")
     return path
+
+
+def result_file(what: str, device: str, config: object) -> Path:
+    """The file results/<what>--<device>--<date>.json, numbered from 2 on if results of another config have the name."""
+    stem = f"{what}--{device.split(':')[0]}--{date.today().isoformat()}"
+    names = itertools.chain([stem], (f"{stem}--{number}" for number in itertools.count(2)))
+    paths = (RESULTS / f"{name}.json" for name in names)
+    wanted = json.loads(json.dumps(config))
+    return next(path for path in paths if not path.exists() or json.loads(path.read_text())["config"] == wanted)
 
 
 def synchronise(device: str) -> None:

@@ -8,8 +8,8 @@ shows while the view moves (no camera is sampled). Every method completes the sa
 three frames just before it and three further back. Geometry and rendering are not part of the times.
 
 Each size is a run of its own that includes the fastest baseline; ratios are within one run. With --write, results of
-the same day are merged, so a slow machine can be measured in parts. With --windows N, N windows of a view are run and
-the network's time is extrapolated to all of them.
+the same day are merged, each with its own settings, so a slow machine can be measured in parts. With --windows N, N
+windows of a view are run and the network's time is extrapolated to all of them.
 """
 
 import argparse
@@ -19,13 +19,12 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from itertools import product
 from typing import Any
 
 import benchmarks_path  # noqa: F401
 import torch
-from measure import RESULTS, summarise, synchronise, write
+from measure import machine, result_file, summarise, synchronise, write
 from stream_adapter import STREAMED, Streamed
 from torch import Tensor
 
@@ -277,18 +276,22 @@ def main() -> None:
     config = {
         "seed": SEED,
         "weights": "random",
-        "precision": {"ours": options.precision, "baselines": "float32"},
         "past": "3 frames before, 3 further back",
         "window_px": OnlineConfig().size_px,
     }
-    earlier = RESULTS / f"baselines--{options.device.split(':')[0]}--{date.today().isoformat()}.json"
+    earlier = result_file("baselines", options.device, config)
     results: dict[str, object] = json.loads(earlier.read_text())["results"] if earlier.exists() else {}
+
+    parts = (options.ours, options.networks, options.framings)
+    chosen = ", ".join([options.precision, *map(" ".join, parts)])
+    precision = {"ours": options.precision, "baselines": "float32"}
+    own = {**machine(options.device), "precision": precision, "seconds": options.seconds}
 
     for text in options.sizes:
         width, height = (int(side) for side in text.split("x"))
 
         def done(result: dict, text: str = text) -> None:
-            results[f"{text}, {' '.join(options.networks)}"] = result
+            results[f"{text}, {chosen}"] = {**own, **result}
             if options.write:
                 write("baselines", options.device, config, results)
 

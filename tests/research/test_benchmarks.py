@@ -1,7 +1,9 @@
 """What the benchmarks share: waiting for the right device, files of results, and scores of masks and views."""
 
+import json
 from dataclasses import replace
 
+import baselines
 import benchmarks_path  # noqa: F401
 import measure
 import torch
@@ -27,3 +29,33 @@ def test_empty_masks_and_absent_cameras_have_no_overlap():
     found = replace(frame, mask=empty)
     right = replace(frame, mask=torch.where(torch.arange(4)[:, None, None] == 1, 0, frame.mask).byte())
     assert overlaps(found, right.without(["c3"])) == {"c0": 1.0, "c2": 0.0}
+
+
+def test_results_of_another_config_of_the_same_day_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(measure, "RESULTS", tmp_path / "results")
+    first = measure.write("views", "cpu", {"sets": ("P",)}, 1)
+    second = measure.write("views", "cpu", {"sets": ("Q",)}, 2)
+    assert first != second == measure.write("views", "cpu", {"sets": ("Q",)}, 3)
+    assert [json.loads(path.read_text())["results"] for path in (first, second)] == [1, 3]
+
+
+def test_parts_of_the_frame_rates_are_merged_with_their_own_settings(tmp_path, monkeypatch):
+    monkeypatch.setattr(measure, "RESULTS", tmp_path)
+
+    def measured(size, options, done):
+        done({"methods": options.framings})
+        return {"fps_of_ours_over": {}}
+
+    monkeypatch.setattr(baselines, "measure", measured)
+    for part in ("--framings win", "--framings mul", "--framings mul --precision bfloat16"):
+        command = f"baselines.py --sizes 8x8 --networks dstt --write {part}"
+        monkeypatch.setattr("sys.argv", command.split())
+        baselines.main()
+    (file,) = tmp_path.iterdir()
+    found = json.loads(file.read_text())["results"].values()
+    assert [(*one["methods"], one["precision"]["ours"]) for one in found] == [
+        ("win", "float32"),
+        ("mul", "float32"),
+        ("mul", "bfloat16"),
+    ]
+    assert all("commit" in one and "threads" in one for one in found)
