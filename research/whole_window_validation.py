@@ -6,7 +6,8 @@
 
 The views are unseen by every training: rigs of 48 cameras in three layers at 512 x 512, a quarter of them held out
 together, and procedural people reserved for validation. The true masks M_t are known, as in R48, whose
-scenes are for tests. DATA keeps the views once they are made, which takes about half a minute of one core for a scene.
+scenes are for tests. DATA keeps the views once they are made, which takes about half a minute of one core for a scene,
+and `plan.txt`, what they were made of.
 """
 
 import time
@@ -30,6 +31,7 @@ from viewmend.training.recipes import make_recipe
 from viewmend.training.samples import Sample, true_image
 from viewmend.training.shards import read_shard, shards_of, write_shards
 from viewmend.training.shared_rigs import SharedRigScenes
+from viewmend.utils.atomic_writes import write_text
 
 CAMERAS = 48
 """Cameras of each rig, as in R48."""
@@ -37,6 +39,8 @@ MIN_HOLE_PX = 200
 """Views have at least this many hole pixels inside the true mask, as those of R48."""
 ALL_TOKENS = 2**31
 """More context tokens than any window has."""
+PLAN = "plan.txt"
+"""File with everything that determines the views of a folder."""
 SEED = "whole-windows"
 """Determines the rigs and the choice of people; their own seeds are those reserved for validation."""
 
@@ -87,9 +91,23 @@ class Scored:
 
 
 def make_views(options: Options) -> list[Path]:
-    """A file with the views of each scene, numbered as its rig; those that are not in the folder yet are made."""
+    """A file with the views of each scene, numbered as its rig; those that are not in the folder yet are made.
+
+    Raises:
+        ValueError: the folder has views that were made with other options, or without a plan.
+    """
     shards = shards_of(options.data) if options.data.exists() else []
     source = validation_scenes(options.holdout_views)
+    plan = f"{source.seed}, {MIN_HOLE_PX} hole pixels, {source.config}, {source.sampling}\n"
+    file = options.data / PLAN
+    if not shards:
+        options.data.mkdir(parents=True, exist_ok=True)
+        write_text(file, plan)
+    elif not file.is_file() or file.read_text("utf-8", "replace") != plan:
+        raise ValueError(
+            f"{options.data}: expected views made with the same options (--holdout-views), got others; choose another "
+            "--data"
+        )
     first = 1 + int(shards[-1].stem.split("-")[1]) if shards else 0
     for number in count(first):
         if len(shards) >= options.scenes:

@@ -7,7 +7,7 @@ import torch
 import whole_window_validation
 from training.conftest import MODEL
 from training.test_shared_rigs import SAMPLING, SCENES
-from whole_window_validation import Options, main, validation_scenes
+from whole_window_validation import Options, main, make_views, validation_scenes
 
 from viewmend.models.checkpoint import build, save_inpainter
 from viewmend.scenes.held_out import PROCEDURAL_SEEDS
@@ -52,6 +52,14 @@ def test_weights_tokens_and_contexts_are_compared(small, tmp_path, capsys):
     assert "rig" in printed and "rig" not in again
     first_scores = [row[1] for row in rows]
     assert [line.split(" | ")[1] for line in again.splitlines() if line.startswith("| ")][2:] == first_scores
+
+
+def test_views_that_were_made_with_other_options_are_refused(small, tmp_path, monkeypatch):
+    options = Options(data=tmp_path / "views", scenes=1)
+    assert make_views(options) == make_views(options)
+    monkeypatch.setattr(whole_window_validation, "MIN_HOLE_PX", 30)
+    with pytest.raises(ValueError, match="expected views made with the same options"):
+        make_views(options)
 
 
 def test_views_are_those_of_the_papers_rig():
