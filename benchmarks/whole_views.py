@@ -234,14 +234,16 @@ def completed_views(
         rule = RenderConfig(error_rule="predicted", refine_fraction=part) if part else RenderConfig()
         config = StreamConfig(memory_mb=None, render=rule, background=options.background)
         stream = Stream(make_method(name), config, frame.bounds)
-        quality = RenderQuality(refine_fraction=0.0 if fraction and not part else None)
         cached = stream.add_frame(frame.inputs, geometry)
         if isinstance(geometry, DepthMaps):
             depth = geometry.maps[geometry.names.index("target")]
             view, _ = render_depth(frame.inputs, target, depth, cached.depth, rule)
-            view = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
+            if stream.error_rule != "holes":
+                view = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
+            quality = RenderQuality(refine_fraction=part if fraction else None)
             yield model, stream.mend(view, quality=quality).completed, truth
         else:
+            quality = RenderQuality(refine_fraction=0.0 if fraction and not part else None)
             yield model, stream.view(target, quality=quality).completed, truth
 
 
@@ -297,7 +299,7 @@ def other_geometry(
     else:
         corners = mesh.vertices[mesh.faces.long()]
         area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
-        share = torch.distributions.Exponential(1.0).sample((POINTS, 3))
+        share = torch.empty(POINTS, 3).exponential_(generator=rng)
         face = torch.multinomial(area, POINTS, replacement=True, generator=rng)
         points = (corners[face] * (share / share.sum(1, keepdim=True))[..., None]).sum(1)
         maps = [*splat(points, inputs.cameras), *splat(points, target)]

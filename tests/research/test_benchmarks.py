@@ -1,14 +1,20 @@
 """What the benchmarks share: waiting for the right device, files of results, and scores of masks and views."""
 
 import json
+from argparse import Namespace
 from dataclasses import replace
 
 import baselines
 import benchmarks_path  # noqa: F401
 import measure
+import pytest
 import torch
+import whole_views
 from masks import overlaps
 from reference.ball import BallCapture, ring
+
+from viewmend.scenes.studio_scenes import StudioScene
+from viewmend.studio.stage import StudioConfig
 
 
 def test_the_device_that_is_timed_is_waited_for_and_named(monkeypatch):
@@ -59,3 +65,27 @@ def test_parts_of_the_frame_rates_are_merged_with_their_own_settings(tmp_path, m
         ("mul", "bfloat16"),
     ]
     assert all("commit" in one and "threads" in one for one in found)
+
+
+@pytest.mark.parametrize("proxy", ["depth", "splats"])
+def test_models_behind_depth_maps_have_their_own_error_rule_and_fraction(proxy, monkeypatch):
+    monkeypatch.setattr(whole_views, "POINTS", 4000)
+    config = StudioConfig(seed=1, cameras=5, frames=1, size_px=96)
+    scene = StudioScene(name="s", set="P", rig="ring of 5", style="calm", config=config, held="cam02")
+    options = Namespace(
+        models=["telea", "views", "views@0.15"],
+        proxy=proxy,
+        background="black",
+        grow_masks=0,
+        no_tighten_masks=True,
+    )
+    first, again = (
+        {model: made.view for model, made, _ in whole_views.completed_views(scene, options, 0)}
+        for _ in range(2)
+    )
+    telea, views, restricted = first.values()
+    assert bool(telea.holes.any()) and torch.equal(telea.error > 0, telea.holes)
+    covered = int((views.mask > 0).sum())
+    assert int((views.error > 0).sum()) >= covered
+    assert int(restricted.refine_mask.sum()) <= max(0.15 * covered, int(restricted.holes.sum())) < covered
+    assert all(torch.equal(first[model].depth, again[model].depth) for model in first), "the same splats"
