@@ -76,7 +76,9 @@ def result_file(what: str, device: str, config: object) -> Path:
     names = itertools.chain([stem], (f"{stem}--{number}" for number in itertools.count(2)))
     paths = (RESULTS / f"{name}.json" for name in names)
     wanted = json.loads(json.dumps(config))
-    return next(path for path in paths if not path.exists() or json.loads(path.read_text())["config"] == wanted)
+    return next(
+        path for path in paths if not path.exists() or json.loads(path.read_text())["config"] == wanted
+    )
 
 
 def synchronise(device: str) -> None:

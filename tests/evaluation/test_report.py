@@ -81,7 +81,10 @@ def test_every_setting_of_the_cells_is_stated(evaluated):
     stream = StreamConfig(geometry="fused", render=render, memory_mb=None)
     settings = RunSettings(stream=stream, top_k=64, precision="bfloat16")
     report = make_report(
-        cells, METHODS[:2], settings, preparation={"align": False, "match_colours": True, "tighten_masks": False}
+        cells,
+        METHODS[:2],
+        settings,
+        preparation={"align": False, "match_colours": True, "tighten_masks": False},
     )
     (line,) = setting_lines(report)
     for said in (

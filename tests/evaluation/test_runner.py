@@ -9,6 +9,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,10 +21,12 @@ from viewmend.evaluation.result_cache import CellStore, cell_keys
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scores import Scorers
+from viewmend.metrics.weights import FOLDERS_VARIABLE
 from viewmend.models.classical import Telea
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import StreamConfig
 from viewmend.types import CompletedView
+from viewmend.utils.weight_files import MissingWeightsError
 
 METHODS = ("telea", "unfilled")
 SCRIPT = (
@@ -262,6 +265,74 @@ def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
     subprocess.run(script(small_scenes, tmp_path, "local"), check=True, capture_output=True)
     assert len(list((tmp_path / "cells").glob("*.json"))) == len(METHODS) * len(small_scenes)
     assert scores(run(small_scenes, tmp_path / "cells")) == scores(whole[1])
+
+
+class RayError(Exception):
+    """As Ray's."""
+
+
+class RayTaskError(RayError):
+    """As Ray's: a task raised an exception."""
+
+    def __init__(self, cause):
+        super().__init__("a long traceback")
+        self.cause = cause
+
+
+class ClusterOfThisProcess:
+    """Stands for Ray; tasks run when they are waited for, as if in a process that was started elsewhere."""
+
+    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+
+    def __init__(self, folder, monkeypatch):
+        self.folder = folder
+        self.monkeypatch = monkeypatch
+
+    def is_initialized(self):
+        return True
+
+    def remote(self, **cost):
+        return lambda work: SimpleNamespace(remote=partial(partial, work))
+
+    def wait(self, futures):
+        return futures[:1], futures[1:]
+
+    def get(self, future):
+        with self.monkeypatch.context() as elsewhere:
+            elsewhere.chdir(self.folder)
+            elsewhere.delenv(FOLDERS_VARIABLE, raising=False)
+            try:
+                return future()
+            except MemoryError as error:
+                raise RayError("died") from error
+            except Exception as error:
+                raise RayTaskError(error) from error
+
+
+def test_tasks_on_a_cluster_have_the_commands_folder_and_weights_and_say_what_they_raised(
+    small_scenes, tmp_path, monkeypatch
+):
+    seen = []
+    outcomes = iter((None, MissingWeightsError("no\nweights"), MemoryError()))
+
+    def evaluate(scene, methods, settings):
+        seen.append((Path.cwd(), os.environ[FOLDERS_VARIABLE]))
+        outcome = next(outcomes)
+        if outcome is not None:
+            raise outcome
+        return SceneRun(scene.name, tuple(MethodRun(name) for name in methods))
+
+    monkeypatch.setattr(cluster, "evaluate_scene", evaluate)
+    (tmp_path / "elsewhere").mkdir()
+    ray = ClusterOfThisProcess(tmp_path / "elsewhere", monkeypatch)
+    monkeypatch.setattr(cluster, "find_ray", lambda address: ray)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(FOLDERS_VARIABLE, "own-weights")
+    cells = run(small_scenes, tmp_path / "cells", ("unfilled",), ray="host:1")
+    assert seen == [(tmp_path, "own-weights")] * 3
+    done, raised, died = (cell.error for cell in cells.values())
+    assert done is None and raised == "MissingWeightsError: no weights"
+    assert "its process on the cluster died (died); is there enough memory?" in died
 
 
 def test_a_missing_cluster_is_one_clear_error(small_scenes, tmp_path, monkeypatch):

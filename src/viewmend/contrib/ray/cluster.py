@@ -4,10 +4,13 @@ import os
 import secrets
 import socket
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from viewmend.evaluation.runner import Task
 from viewmend.evaluation.scene_run import RunSettings, SceneRun, evaluate_scene
+from viewmend.metrics.weights import FOLDERS_VARIABLE
 
 ANSWER_S = 5.0
 """A cluster has to answer within this many seconds."""
@@ -71,8 +74,8 @@ def connect(ray: Any, address: str, **own: object) -> None:
 def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Iterator[tuple[Task, SceneRun]]:
     """The results of all tasks as they finish; each task runs on one core, or on one GPU.
 
-    Machines of the cluster need this package, and captures, people and models at the same paths. A
-    task whose process dies fails alone.
+    Machines of the cluster need this package, and captures, people, models and weights at the same
+    paths. A task that raises, or whose process dies, fails alone.
 
     Raises:
         ValueError: Ray is not installed, or there is no cluster at the address.
@@ -86,13 +89,18 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> It
     try:
         cost = {"num_cpus": 1, "num_gpus": 1 if settings.device.startswith("cuda") else 0, "max_retries": 0}
         evaluate = ray.remote(**cost)(_evaluate_on_one_core)
-        waiting = {evaluate.remote(task, settings): task for task in tasks}
+        # Ray's processes have another working directory and, on a running cluster, another environment.
+        here = str(Path.cwd()), os.environ.get(FOLDERS_VARIABLE, "")
+        waiting = {evaluate.remote(task, settings, *here): task for task in tasks}
         while waiting:
             finished, _ = ray.wait(list(waiting))
             done = finished[0]
             task = waiting.pop(done)
             try:
                 yield task, ray.get(done)
+            except ray.exceptions.RayTaskError as error:
+                cause = error.cause
+                yield task, task.failed(f"{type(cause).__name__}: {' '.join(str(cause).split())}")
             except ray.exceptions.RayError as error:
                 reason = " ".join(str(error).split())[:200]
                 yield (
@@ -104,8 +112,13 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> It
             ray.shutdown()
 
 
-def _evaluate_on_one_core(task: Task, settings: RunSettings) -> SceneRun:
+def _evaluate_on_one_core(task: Task, settings: RunSettings, folder: str, weights: str) -> SceneRun:
+    """Evaluate a task in the working directory, and with the folders of weights, of the command."""
     import torch
 
     torch.set_num_threads(1)
+    with suppress(FileNotFoundError):  # another machine, where only absolute paths are valid
+        os.chdir(folder)
+    if weights:
+        os.environ[FOLDERS_VARIABLE] = weights
     return evaluate_scene(task.scene, task.methods, settings)
