@@ -163,7 +163,10 @@ class SplitScene(Struct, frozen=True, kw_only=True):
     split: Literal["training", "test"]
     left_out: str
     closest: tuple[str, ...]
-    """The three others closest to it, in angle at the point that all cameras look at, nearest first."""
+    """The three others closest to it, in angle at the point that all cameras look at, nearest first.
+
+    Indicative: the renderer chooses again in each frame, by the angle at the hull's centre.
+    """
     calibration_sha256: str
     """Hash of names, lenses and poses: another calibration is another scene."""
 
