@@ -205,7 +205,7 @@ class MendSummary:
         return mean_over_frames([getattr(s, metric) for s in scores], pixels.get(metric))
 
     def stage_ms(self) -> dict[str, float]:
-        """Median milliseconds of each stage over the views in which it ran: several may share a frame's geometry."""
+        """Median milliseconds of each stage where it ran: views of one frame share its geometry."""
         times = [asdict(stages) for stages in self._times]
         stages = times[0] if times else ()
         return {stage: median([t[stage] for t in times if t[stage]] or [0.0]) for stage in stages}

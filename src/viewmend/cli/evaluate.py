@@ -210,7 +210,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
 
 
 def _check_used(options: RunOptions, sets: tuple[str, ...]) -> None:
-    """Raise a ValueError for an option that none of the sets uses, or for a background that one of them lacks."""
+    """Raise a ValueError for an option that none of the sets uses, or a background that one lacks."""
     captures = [name for name in sets if name not in SYNTHETIC_SETS]
     people = [name for name in sets if name in SYNTHETIC_SETS and name[0] in "QR"]
     default = RunOptions(out=options.out)

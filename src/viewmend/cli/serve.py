@@ -162,8 +162,8 @@ def _check(options: Options) -> None:
     as_read = (Options.max_image_size, PreparationOptions())
     if options.source == "live" and (options.max_image_size, options.preparation) != as_read:
         raise ValueError(
-            "expected neither --max-image-size nor --no-align, --no-match-colours or --no-tighten-masks with live, "
-            "whose frames are used as they are pushed; leave it out"
+            "expected neither --max-image-size nor --no-align, --no-match-colours or --no-tighten-masks "
+            "with live, whose frames are used as they are pushed; leave it out"
         )
     if options.ray is not None and options.source == "live":
         raise ValueError(

@@ -69,7 +69,7 @@ class Records:
         return mean(self.by_scene(metric, region).values())
 
     def standard_error(self, metric: str, region: str) -> float | None:
-        """Standard error of `mean` over scenes; None for fewer than `MIN_ERROR_SCENES`, and for means of sets."""
+        """Standard error of `mean` over scenes; None for means of sets, or below `MIN_ERROR_SCENES`."""
         scenes = Records(tuple(r for r in self.all if r.scene != r.set))
         values = list(scenes.by_scene(metric, region).values())
         if len(values) < MIN_ERROR_SCENES:

@@ -52,8 +52,8 @@ RULES = (
     "each video of up to 16 frames in [0, 1], Frechet distance over all videos of the table, with I3D in evaluation "
     'mode and, as published scripts run it, in training mode ("train"). Networks without weights are n/a.',
     f"Frames with fewer than {MIN_HOLE_PX} pixels of a kind are left out of the scores over them, and counted.",
-    "Means are taken over the frames of a scene, then over the scenes of a set, then over sets. ± is the standard "
-    "error over the scenes of a set.",
+    "Means are taken over the frames of a scene, then over the scenes of a set, then over sets. "
+    "± is the standard error over the scenes of a set.",
     "Methods use the past frames of the source cameras and their own results, never the held-out camera. Only rgvi is "
     "given the true past frames, as in the paper, and is not comparable.",
     f"The gain over {REFERENCE} is the mean over the scenes where both have a score.",
@@ -368,7 +368,7 @@ def _best(rows: Sequence[Row], column: Column) -> float | None:
 
 
 def _can_be_best(row: Row) -> bool:
-    """Whether its means compare with those of others: it is not given the truth, and completed the same scenes."""
+    """Whether its means compare with others: it is not given the truth, and completed all scenes."""
     return row.method not in PRIVILEGED and not row.failed
 
 
