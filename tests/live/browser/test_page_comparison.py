@@ -110,6 +110,7 @@ def test_until_another_result_arrives_the_drawn_view_is_shown(browser):
 
     query = "?time=0&panel=0&mode=split&left=completed&right=compared:paper-small"
     with running(inpainter=Green()) as server, opened(browser, server, query=query) as view:
+        view.page.set_viewport_size({"width": 480, "height": 320})
         server.service.renderer._models["paper-small"] = Green()
         view.until(lambda: are_green(view) == [True, True], SCREENSHOT_S)
         (session,) = server.live.registry.sessions

@@ -97,13 +97,10 @@ def test_a_connection_that_broke_without_a_close_is_restored(browser, server):
     impatient = worker.content.replace(b"PING_MS = 5000", b"PING_MS = 300")
     server.files["link/worker.js"] = replace(worker, content=impatient)
     with opened(browser, server) as view:
-        view.settle()
-        count = len(server.hellos)
+        view.until(lambda: server.looks)
         for viewer in server.viewers:
             viewer.silent = True
-        view.until(lambda: len(server.hellos) > count)
-        view.drag(60, 0)
-        view.settle()
+        view.until(lambda: any(viewer.look and not viewer.silent for viewer in list(server.viewers)))
 
 
 def test_a_page_that_repaints_slowly_gets_no_more_pictures_than_it_takes(browser, server):
