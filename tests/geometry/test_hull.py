@@ -170,6 +170,21 @@ def test_a_grid_is_summarised_as_on_a_device(shape, value, rng):
     assert summary.filled == filled_sides(values > FAINT)
 
 
+@pytest.mark.parametrize("target_x", [1.0, 1.1])
+@pytest.mark.parametrize("shown", [0, 1])
+def test_parallel_or_diverging_cameras_have_an_empty_hull_if_fewer_than_two_masks_show_something(
+    target_x, shown
+):
+    pair = [camera_at((x, 0.0, 0.0), target=(target_x * x, 0.0, 3.0)) for x in (-0.4, 0.4)]
+    cameras = concatenate_cameras(pair)
+    masks = ball_masks(cameras, center=(0.0, 0.0, 3.0))
+    assert len(reconstruct(masks, cameras, None, SMALL).mesh.vertices)
+    masks[shown:] = 0
+    proxy = reconstruct(masks, cameras, None, SMALL)
+    assert len(proxy.mesh.vertices) == 0
+    assert float(proxy.center[2]) > 0, "the middle of its box is in front of the cameras"
+
+
 def test_one_camera_is_an_error():
     cameras = dome(3)
     masks = ball_masks(cameras)

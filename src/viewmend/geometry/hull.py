@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import conv2d, normalize, pad
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
@@ -357,24 +357,26 @@ def bounds_from_cameras(cameras: Cameras) -> Bounds:
 def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bounds:
     """A cube that holds the masks' subject: centred where the rays through the masks' middles come closest.
 
-    The cube of `bounds_from_cameras` if fewer than two masks have foreground, or if the rays meet behind
-    all cameras, as with masks of different things.
+    The cube of `bounds_from_cameras` if the rays meet behind all cameras, as with masks of different things.
+    If fewer than two masks have foreground, there is no hull to find: then it is that cube or, where there
+    is none, one in front of the cameras.
 
     Raises:
-        ValueError: there is one camera only, or the cameras look away from each other.
+        ValueError: there is one camera only; or two masks have foreground, and the cameras look away from
+            each other.
     """
     check_views(cameras)
     rig = cameras.on_host
     boxes = _mask_boxes(mask)
     some = [view for view in range(len(rig)) if boxes[view] is not None]
     if len(some) < 2:
-        return bounds_from_cameras(rig)
+        return _bounds_without_subject(rig)
     seeing = rig[some]
     box = torch.tensor([boxes[view] for view in some]).to(rig.K)
     middle = (box[:, :2] + box[:, 2:]) / 2
     pixels = torch.cat([middle, torch.ones_like(middle[:, :1])], -1)
     rays = torch.linalg.solve(seeing.K, pixels[..., None])
-    directions = torch.nn.functional.normalize((seeing.world_from_camera[:, :3, :3] @ rays)[..., 0], dim=-1)
+    directions = normalize((seeing.world_from_camera[:, :3, :3] @ rays)[..., 0], dim=-1)
     focal = torch.stack([seeing.K[:, 0, 0], seeing.K[:, 1, 1]], -1)
     # The subject may be nearer to a camera than its middle and is round: take half as much again.
     half = 1.5 * ((box[:, 2:] - box[:, :2]) / 2 / focal).amax(-1)
@@ -382,6 +384,18 @@ def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras
         return _cube_around(seeing, directions, half, largest=True)
     except ValueError:
         return bounds_from_cameras(rig)
+
+
+def _bounds_without_subject(cameras: Cameras) -> Bounds:
+    """The cube of `bounds_from_cameras`; one in front of the rig, twice its extent, if axes are parallel or diverge."""
+    try:
+        return bounds_from_cameras(cameras)
+    except ValueError:
+        centers = cameras.centers
+        extent_m = (centers.amax(0) - centers.amin(0)).amax().clamp_min(NEAR_M)
+        ahead = normalize(cameras.world_from_camera[:, :3, 2].mean(0), dim=0)
+        middle = centers.mean(0) + 2 * extent_m * ahead
+        return Bounds(middle - extent_m, middle + extent_m)
 
 
 def _mask_boxes(mask: UInt8[Tensor, "view height width"]) -> list[tuple[int, int, int, int] | None]:

@@ -69,7 +69,8 @@ def reconstruct(
     the masks agree on no point of space, or are empty, the proxy is empty.
 
     Raises:
-        ValueError: there is one camera only, or the cameras look away from each other.
+        ValueError: there is one camera only; or `bounds` is None, two masks have foreground, and the cameras
+            look away from each other.
     """
     config = config or HullConfig()
     check_views(cameras)
