@@ -20,6 +20,7 @@ from viewmend.geometry.hull import (
     any_in_blocks,
     bounds_from_cameras,
     bounds_from_masks,
+    choose_pools,
     filled_sides,
     needed_views,
     occupied_bounds,
@@ -39,13 +40,14 @@ def path(request, monkeypatch) -> str:
 
 
 def mixed_rig():
-    """Views of two sizes that crop the subject, one camera amid the volume, one turned away from it; soft masks."""
+    """Views of three sizes that crop the subject, one camera amid the volume, one turned away from it; soft masks."""
     views = [
         camera_at((2.0, 0.3, 0.1), width=40, height=30),
         camera_at((0.2, -0.3, 2.0), width=30, height=44),
         camera_at((-1.4, 0.8, -1.0), width=40, height=44, fov=0.4),
         camera_at((0.4, 0.3, -0.2), target=(-1.0, 0.0, 0.3), width=36, height=30, fov=1.2),
         camera_at((0.0, 0.2, -2.0), target=(0.0, 0.2, -3.0), width=30, height=30),
+        camera_at((1.5, -0.5, -1.2), width=17, height=13),
     ]
     cameras = concatenate_cameras(views)
     masks = ball_masks(cameras)
@@ -54,16 +56,16 @@ def mixed_rig():
     return cameras, masks
 
 
-@pytest.mark.parametrize("pixels_per_voxel", [1.0, 30.0])
-def test_equals_the_twin(path, pixels_per_voxel):
+@pytest.mark.parametrize(("pixels_per_voxel", "distinct"), [(1.0, 2), (30.0, 1)])
+def test_equals_the_twin(path, pixels_per_voxel, distinct):
     cameras, masks = mixed_rig()
     config = replace(SMALL, pixels_per_voxel=pixels_per_voxel)
     bounds = Bounds(torch.tensor([-0.7, -0.6, -0.5]), torch.tensor([0.6, 0.7, 0.6]))
     grid = visual_hull(masks, cameras, bounds, config)
-    pool = max(1, int(hull_module._footprint_px(cameras, bounds, grid.voxel_m) / pixels_per_voxel))
-    assert (pool > 1) == (pixels_per_voxel == 1.0)
-    needed = hull_module.needed_views(5, config, hull_module.count_cut_off(masks, cameras))
-    twin = hull_twin(masks, cameras, grid.low, grid.voxel_m, grid.values.shape, pool, needed)
+    pools = choose_pools(cameras, bounds, grid.voxel_m, pixels_per_voxel)
+    assert len(set(pools)) == distinct and (max(pools) > 1) == (pixels_per_voxel < 30)
+    needed = hull_module.needed_views(6, config, hull_module.count_cut_off(masks, cameras))
+    twin = hull_twin(masks, cameras, grid.low, grid.voxel_m, grid.values.shape, pools, needed)
     # A voxel whose image is on an image's very border may be seen by one and not by the other.
     assert ((grid.values - torch.from_numpy(twin)).abs() > 0.01).float().mean() < 1e-3
     assert 0.05 < (grid.values > 0.5).float().mean() < 0.95
@@ -123,6 +125,22 @@ def test_the_search_finds_nothing_where_masks_contradict(path):
     masks = ball_masks(cameras, radius=0.3)
     masks[2] = 0
     assert occupied_bounds(masks, cameras, around(0.8), HullConfig()) is None
+
+
+def test_cameras_of_low_resolution_carve_no_thin_parts_away(path):
+    """A rod of 4 voxels, whose image is 4 pixels wide in two of the five cameras, and 40 in the others."""
+    large = dome(3, width=480, height=400)
+    small = [camera_at(eye, width=48, height=40) for eye in ((-1.9, 0.4, 1.7), (1.5, -0.3, -2.0))]
+    cameras = concatenate_cameras([large, *small])
+    masks = torch.zeros(5, 400, 480, dtype=torch.uint8)
+    for view, (width, height) in enumerate(cameras.sizes):
+        half = width // 24
+        masks[view, :height, width // 2 - half : width // 2 + half] = 255
+    config = HullConfig(resolution=40)
+    bounds = around(0.8)
+    assert choose_pools(cameras, bounds, 0.04, 2.0) == (4, 4, 4, 1, 1)
+    values = visual_hull(masks, cameras, bounds, config).values
+    assert (values[19:21, 10:30, 19:21] > ISO).all()
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 1000.0])

@@ -4,13 +4,13 @@ import numpy as np
 from scipy import ndimage
 
 
-def hull_twin(mask, cameras, low, voxel_m, shape, pool, needed):
+def hull_twin(mask, cameras, low, voxel_m, shape, pools, needed):
     """Occupancy of a grid from masks that are pooled and smoothed first."""
-    soft = [soften(mask[v].numpy(), cameras.size_px[v].tolist(), pool) for v in range(len(cameras))]
+    soft = [soften(mask[v].numpy(), cameras.size_px[v].tolist(), pools[v]) for v in range(len(cameras))]
     values = np.zeros(shape)
     for index in np.ndindex(*shape):
         point = low.double().numpy() + (np.array(index) + 0.5) * voxel_m
-        seen = [look_up(soft[v], cameras, v, point, pool) for v in range(len(cameras))]
+        seen = [look_up(soft[v], cameras, v, point, pools[v]) for v in range(len(cameras))]
         seen = [value for value in seen if value is not None]
         values[index] = min(seen) if len(seen) >= needed else 0
     return values

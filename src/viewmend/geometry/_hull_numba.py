@@ -20,10 +20,11 @@ NEAR_M = 1e-6
 def soften(mask, rows, columns, pool, out):
     """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
 
-    Beyond the image's own rows and columns its border continues, in the last row and column of `out` as well.
+    Beyond the image's own rows and columns its border continues, and by one row and column beyond the
+    pooled mask; `out` may be larger.
     """
-    height = out.shape[0] - 1
-    width = out.shape[1] - 1
+    height = -(-mask.shape[0] // pool)
+    width = -(-mask.shape[1] // pool)
     smooth = np.empty((height, width), np.int32)
     column_sums = np.empty(width * pool, np.int32)
     pooled = np.empty(width, np.int32)
@@ -52,12 +53,15 @@ def soften(mask, rows, columns, pool, out):
             total = smooth[above, x] + 2 * smooth[y, x] + smooth[below, x]
             out[y, x] = np.uint8(np.float32(total) * scale + np.float32(0.5))
         out[y, width] = out[y, width - 1]
-    out[height] = out[height - 1]
+    out[height, : width + 1] = out[height - 1, : width + 1]
 
 
 @kernel
 def count_tiles(image, rows, columns, tile, sums):
-    """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1])."""
+    """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1]).
+
+    Tiles beyond the rows and columns have none and are all of it: they decide nothing.
+    """
     sums[:] = 0
     largest = np.empty(columns, np.uint8)
     smallest = np.empty(columns, np.uint8)
@@ -140,7 +144,7 @@ def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, slab, occup
 
 
 @kernel
-def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, block, first, values):
+def carve_blocks(P, lens, size, soft, pools, tile, sums, low, voxel_m, needed, block, first, values):
     """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
     end_x = min(first + block, values.shape[0])
     end_y = values.shape[1]
@@ -158,7 +162,9 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
             undecided = 0
             for n in range(len(order)):
                 view = order[n]
-                verdict = judge(P[view], lens[view], x, y, z, radius, size[view], pool, tile, sums[view])
+                verdict = judge(
+                    P[view], lens[view], x, y, z, radius, size[view], pools[view], tile, sums[view]
+                )
                 if verdict == EMPTY:
                     # It will call the next block empty as well: ask it first.
                     order[n] = order[0]
@@ -180,12 +186,12 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
             else:
                 corner = (low[0] + first * voxel_m, low[1] + first_y * voxel_m, low[2] + first_z * voxel_m)
                 carve_voxels(
-                    P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch
+                    P, size, soft, pools, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch
                 )
 
 
 @kernel
-def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values, scratch):
+def carve_voxels(P, size, soft, pools, low, voxel_m, needed, seen_before, views, values, scratch):
     """Fill `values` with the smallest bilinear mask value of the `views` that see a voxel; 0 where too few do.
 
     One camera after another is asked about the voxels that are left, gathered at the front of `scratch`.
@@ -210,7 +216,7 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
     origin = (low[0] + 0.5 * voxel_m, low[1] + 0.5 * voxel_m, low[2] + 0.5 * voxel_m)
     for n in range(len(views)):
         view = views[n]
-        locate(P[view], origin, voxel_m, size[view], pool, left, scratch)
+        locate(P[view], origin, voxel_m, size[view], pools[view], left, scratch)
         kept = sample(soft[view], left, scratch)
         if kept < left // 2:
             # A camera that empties much of this block will empty much of the next: ask it first.

@@ -32,6 +32,8 @@ ISO = 0.5
 """A voxel is inside if its occupancy is at least this; the surface is where the occupancy equals it."""
 FAINT = 0.1
 """A voxel is surely empty if its occupancy is not above this."""
+MOST_POOLING = 2.0
+"""A mask is pooled at most this many times as much as its own camera's resolution requires."""
 NEAR_M = 1e-6
 """A camera does not see what is nearer than this, in metres."""
 SAMPLES = 1 << 24
@@ -58,8 +60,8 @@ class HullConfig:
     coarse_passes: int = 3
     """Passes of that search; with 0, carving begins with the whole bounds."""
     pixels_per_voxel: float = 2.0
-    """Masks are pooled until a voxel spans about this many pixels, then smoothed, to avoid
-    staircase artefacts."""
+    """Masks are pooled until a voxel spans about this many pixels, in the median camera and at least
+    half as many in every other, then smoothed, to avoid staircase artefacts."""
     min_views: int = 2
     """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
@@ -152,11 +154,11 @@ def visual_hull(
     check_views(cameras)
     voxels = Cubes.of(bounds, config.resolution)
     needed = needed_views(len(cameras), config, count_cut_off(mask, cameras))
-    pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
+    pools = choose_pools(cameras, bounds, voxels.side_m, config.pixels_per_voxel)
     if _has_kernels(mask):
-        values = _carve_cpu(mask, pool, cameras, voxels, needed)
+        values = _carve_cpu(mask, pools, cameras, voxels, needed)
     else:
-        values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
+        values = carve(soften(mask, cameras.size_px, pools), pools, cameras, voxels, needed)
     return OccupancyGrid(values, voxels.low, voxels.side_m)
 
 
@@ -172,9 +174,8 @@ def occupied_bounds(
     if _has_kernels(mask):
         if not bool(mask.any()):
             return None
-        find = partial(
-            _occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras
-        )
+        sizes = [(mask.shape[1], mask.shape[2])] * len(mask)
+        find = partial(_occupied_cpu, _count_tiles(mask.numpy(), sizes, tile), tile, cameras)
     else:
         find = partial(occupied_blocks, count_tiles(mask, tile), tile, cameras)
     box = bounds.on_host
@@ -267,12 +268,22 @@ def are_cut_off(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> B
     return ((rows > CUT_OFF * width[:, None]) | (columns > CUT_OFF * height[:, None])).any(-1)
 
 
-def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
-    """The image size of `length_m` at the middle of the bounds, in the median camera that has it in front."""
+def choose_pools(
+    cameras: Cameras, bounds: Bounds, voxel_m: float, pixels_per_voxel: float
+) -> tuple[int, ...]:
+    """How many pixels, along each side, of each camera's mask become one.
+
+    As many for all as suit the median camera that has the middle of the bounds in front; fewer for a camera
+    of much lower resolution there, whose mask would lose its thin parts (`MOST_POOLING`).
+    """
     rig = cameras.on_host
     z = project(bounds.on_host.center[None], rig)[1][:, 0]
-    size = (rig.K[:, 0, 0] * length_m / z)[z > length_m]
-    return float(size.median()) if len(size) else 1.0
+    suited = (rig.K[:, 0, 0] * voxel_m / z / pixels_per_voxel).where(z > voxel_m, torch.nan)
+    median = float(suited.nanmedian())
+    usual = max(1, int(1 / pixels_per_voxel if math.isnan(median) else median))
+    return tuple(
+        usual if math.isnan(own) else max(1, min(usual, int(MOST_POOLING * own))) for own in suited.tolist()
+    )
 
 
 def _has_kernels(data: Tensor) -> bool:
@@ -288,34 +299,39 @@ def kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
 
 
 def _carve_cpu(
-    mask: UInt8[Tensor, "view height width"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
+    mask: UInt8[Tensor, "view height width"],
+    pools: Sequence[int],
+    cameras: Cameras,
+    voxels: Cubes,
+    needed: int,
 ) -> Float[Tensor, "x y z"]:
     from viewmend.geometry import _hull_numba as kernels
 
     views, height, width = mask.shape
-    rows = -(-height // pool)
-    columns = -(-width // pool)
+    pooled = [(-(-height // pool), -(-width // pool)) for pool in pools]
+    rows, columns = max(pooled)
     P, lens, size, low = kernel_arrays(cameras, voxels)
     masks = mask.numpy()
     soft = np.empty((views, rows + 1, columns + 1), np.uint8)
-    parallel_for(lambda view: kernels.soften(masks[view], *size[view, ::-1], pool, soft[view]), views)
-    sums = _count_tiles(soft, rows, columns, BLOCK)
+    parallel_for(lambda view: kernels.soften(masks[view], *size[view, ::-1], pools[view], soft[view]), views)
+    sums = _count_tiles(soft, pooled, BLOCK)
 
     values = torch.empty(voxels.shape)
     out = values.numpy()
-    given = (P, lens, size, soft, pool, BLOCK, sums, low, voxels.side_m, needed, BLOCK)
+    given = (P, lens, size, soft, np.array(pools), BLOCK, sums, low, voxels.side_m, needed, BLOCK)
     parallel_for(lambda slab: kernels.carve_blocks(*given, slab * BLOCK, out), -(-voxels.shape[0] // BLOCK))
     return values
 
 
 def _count_tiles(
-    images: np.ndarray, height: int, width: int, tile: int
+    images: np.ndarray, sizes: Sequence[tuple[int, int]], tile: int
 ) -> Int[np.ndarray, "view row column 2"]:
-    """Summed-area tables of the first rows and columns of each image."""
+    """Summed-area tables of the first rows and columns of each image, as many as `sizes` says."""
     from viewmend.geometry._hull_numba import count_tiles
 
+    height, width = max(sizes)
     sums = np.empty((len(images), -(-height // tile) + 1, -(-width // tile) + 1, 2), np.int32)
-    parallel_for(lambda view: count_tiles(images[view], height, width, tile, sums[view]), len(images))
+    parallel_for(lambda view: count_tiles(images[view], *sizes[view], tile, sums[view]), len(images))
     return sums
 
 
@@ -433,12 +449,35 @@ def _cube_around(
 
 
 def soften(
-    mask: UInt8[Tensor, "view height width"], size_px: Int[Tensor, "view 2"], pool: int
+    mask: UInt8[Tensor, "view height width"], size_px: Int[Tensor, "view 2"], pools: Sequence[int]
 ) -> UInt8[Tensor, "view row column"]:
     """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
 
     Beyond each image's own size its border continues.
+
+    Args:
+        mask: the masks.
+        size_px: width and height of each mask without its padding.
+        pools: the pool of each mask.
     """
+    if len(set(pools)) == 1:
+        return _soften_alike(mask, size_px, pools[0])
+    views, height, width = mask.shape
+    row = torch.arange(-(-height // min(pools)), device=mask.device)
+    column = torch.arange(-(-width // min(pools)), device=mask.device)
+    soft = mask.new_empty(views, len(row), len(column))
+    for pool in set(pools):
+        some = [view for view in range(views) if pools[view] == pool]
+        own = _soften_alike(mask[some], size_px[some], pool)
+        rows, columns = own.shape[1:]
+        soft[some] = own[:, row.clamp(max=rows - 1)][:, :, column.clamp(max=columns - 1)]
+    return soft
+
+
+def _soften_alike(
+    mask: UInt8[Tensor, "view height width"], size_px: Int[Tensor, "view 2"], pool: int
+) -> UInt8[Tensor, "view row column"]:
+    """Masks that are all pooled alike, pooled and smoothed."""
     views, height, width = mask.shape
     rows = -(-height // pool)
     columns = -(-width // pool)
@@ -456,18 +495,25 @@ def soften(
 
 
 def carve(
-    soft: UInt8[Tensor, "view row column"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
+    soft: UInt8[Tensor, "view row column"],
+    pools: Sequence[int],
+    cameras: Cameras,
+    voxels: Cubes,
+    needed: int,
 ) -> Float[Tensor, "x y z"]:
     """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
     points = voxels.centers(soft.device)
     values = torch.ones_like(points[:, 0])
     seen = torch.zeros_like(values, dtype=torch.int32)
     step = max(1, SAMPLES // len(points))
+    alike = len(set(pools)) == 1
+    scale = None if alike else torch.tensor(pools, device=soft.device)[:, None, None]
     for first in range(0, len(cameras), step):
         some = cameras[first : first + step]
         uv, z = project(points, some)
         sees = in_view(uv, z, some)
         images = soft[first : first + step, None].float() / 255
+        pool = pools[0] if scale is None else scale[first : first + step]
         value = sample_bilinear(images, uv / pool, "border")[..., 0]
         values = values.minimum(torch.where(sees, value, 1.0).amin(0))
         seen += sees.sum(0, dtype=torch.int32)
