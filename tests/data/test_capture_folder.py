@@ -11,6 +11,8 @@ from reference.films import write_film
 
 from viewmend.data.capture_folder import open_capture
 from viewmend.data.errors import CaptureError
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.undistortion import pixel_map
 from viewmend.data.videos import VideoFile, VideoWriter
 
 
@@ -241,6 +243,41 @@ def test_depths_are_not_interpolated(plain):
     plain.put("depth/edge.png", depth)
     update(plain, depth="depth/edge.png", dist=BARREL)
     assert set(open_capture(plain.path).read(0).depth[0].unique().tolist()) <= {0.0, 1.0, 3.0}
+
+
+@pytest.mark.parametrize("dist", [[1e-9, 0, 0, 0, 0], [-0.2, 0.1, 0.02, -0.01, -0.02], [-1.2, 0, 0, 0, 0]])
+def test_pixels_are_where_a_lens_distorts_their_rays_to(plain, dist):
+    """Against OpenCV's distortion of points; the last lens model does not describe the image's corners."""
+    K = np.array(plain.description["cameras"][0]["K"])
+    update(plain, 0, dist=dist)
+    found = pixel_map(read_any_calibration(plain.path).cameras[0])
+    v, u = np.mgrid[:32, :40] + 0.5
+    rays = np.linalg.inv(K) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+    no_pose, no_camera = np.zeros(3), np.eye(3)
+    seen = cv2.projectPoints(rays.T, no_pose, no_pose, no_camera, np.array(dist, float))[0][:, 0]
+    expected = (K @ np.hstack([seen, np.ones((len(seen), 1))]).T)[:2].T.reshape(32, 40, 2) - 0.5
+    steps = np.stack([found.fractions % 32, found.fractions // 32], -1)
+    inside = ((expected > 0) & (expected < [39, 31])).all(-1)
+    assert (found.beyond is not None) == (dist[0] < -1)
+    if found.beyond is not None:
+        assert 0 < found.beyond.sum() < 100
+        inside &= ~found.beyond
+    assert inside.sum() > 800
+    assert abs(found.positions + steps / 32 - expected)[inside].max() < 0.51 / 32
+
+
+def test_beyond_what_a_lens_model_describes_the_last_pixels_are_repeated(plain):
+    """With k1 = -0.4 alone and a wide view, the image would begin again, mirrored, where r^2 = 1 / (3 * 0.4)."""
+    K = [[14.0, 0, 20], [0, 14, 16], [0, 0, 1]]
+    stripes = np.tile(np.arange(40, dtype=np.uint8) * 6, (32, 1))
+    plain.put("images/lens.png", np.dstack([stripes] * 3))
+    plain.put("depth/lens.png", np.full((32, 40), 2000, np.uint16))
+    update(plain, 0, dist=[-0.4, 0, 0, 0, 0], image="images/lens.png", K=K)
+    update(plain, depth="depth/lens.png")
+    frame = open_capture(plain.path).read(0)
+    row = frame.rgb[0, 0, 16].int()
+    assert (row.diff() >= 0).all() and row[33] == row[39] < 6 * 30
+    assert frame.depth[0, 16, 39] == 0 and abs(float(frame.depth[0, 16, 30]) - 2) < 1e-6
 
 
 # Videos.
