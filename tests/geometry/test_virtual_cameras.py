@@ -27,11 +27,13 @@ def test_all_cameras_come_first_and_gaps_are_halved():
     assert angles(views).tolist() == pytest.approx([22.5] * 16, abs=0.1)
 
 
-def test_virtual_cameras_look_at_the_centre_from_the_distance_of_their_neighbours():
-    views = surround(ring(6), CENTER, 12, math.radians(5))
+@pytest.mark.parametrize("left", [0.0, 300.0])
+def test_virtual_cameras_look_at_the_centre_from_the_distance_of_their_neighbours(left):
+    """Also if the images of the rig are cut, so that the principal point is outside of them."""
+    views = surround(ring(6).moved(-left, 0.0), CENTER, 12, math.radians(5))
     uv, z = project(CENTER[None], views)
     assert z[:, 0].tolist() == pytest.approx([2.0] * 12, abs=1e-4)
-    assert (uv[:, 0] - views.size_px / 2).abs().max() < 1e-3
+    assert (uv[6:, 0] - views.size_px[6:] / 2).abs().max() < 1e-3
     # the image's up is the world's
     assert (views.camera_from_world[:, 1, 1] < -0.9).all()
 

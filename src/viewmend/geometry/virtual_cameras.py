@@ -43,8 +43,8 @@ def surround(cameras: Cameras, center: Float[Tensor, "3"], most: int, min_angle_
     """Views all around the subject: cameras of the rig, and virtual cameras in the gaps between neighbours.
 
     Views are chosen one after the other, each as far as possible from those chosen before it; all
-    real cameras come first. A virtual camera looks at the centre, with the intrinsics and the image
-    size of the closest real camera.
+    real cameras come first. A virtual camera looks at the centre, with the focal lengths, the skew and the
+    image size of the closest real camera; the centre is in the middle of its image.
 
     Args:
         cameras: the rig.
@@ -72,7 +72,9 @@ def _virtual_camera(
     is_steep = abs(float(direction @ up)) > STEEP
     own_up = -source.camera_from_world[0, 1, :3] if is_steep else up
     pose = look_at(center + places.distance_m[place] * direction, center, own_up)
-    return Cameras((f"virtual{place:03d}",), source.K, pose[None], source.size_px)
+    K = source.K.clone()
+    K[0, :2, 2] = source.size_px[0] / 2
+    return Cameras((f"virtual{place:03d}",), K, pose[None], source.size_px)
 
 
 def _candidates(cameras: Cameras, center: Float[Tensor, "3"]) -> _Candidates | None:
