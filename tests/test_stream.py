@@ -657,14 +657,21 @@ def test_frames_of_the_window_are_dropped_last_and_once_with_a_warning(model, ca
     assert "raise StreamConfig.memory_mb" in record.getMessage() and "2 frames" in record.getMessage()
 
 
-def test_without_a_limit_frames_beyond_any_window_are_dropped_in_both_directions():
+@pytest.mark.parametrize("window_frames", [0, 2 * WINDOW])
+def test_without_a_limit_frames_beyond_any_window_are_dropped_in_both_directions(window_frames):
     """An orbit may play a motion backwards."""
-    stream = Stream(Telea(), replace(CONFIG, memory_mb=None))
+    inpainter = Telea()
+    inpainter.window_frames = window_frames
+    stream = Stream(inpainter, replace(CONFIG, memory_mb=None))
     frame = photograph(SPARSE)
+    reach = max(WINDOW, window_frames)
+    kept = []
     for time in (*range(0, 3 * WINDOW, 10), *reversed(range(0, 3 * WINDOW, 10))):
         stream.add_frame(replace(frame, time=time), Sensors())
-        assert all(abs(other - time) <= WINDOW for other in stream.times)
+        kept.append(time - stream.times[0])
+        assert all(abs(other - time) <= reach for other in stream.times)
         assert time in stream.times
+    assert max(kept) == reach // 10 * 10
 
 
 def test_a_mask_is_predicted_whatever_the_view_attenuates():

@@ -21,7 +21,7 @@ from viewmend.utils.tensors import check_tensor, extremes, size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 WINDOW = REMEMBERED_FRAMES - 1
-"""k_w n_w + n_c: how many frames back the inpainters' temporal windows reach."""
+"""k_w n_w + n_c: how many frames back the shipped inpainters' temporal windows reach."""
 
 
 @runtime_checkable
@@ -181,13 +181,14 @@ def evict(
 
     First go the least recently used of those that the window at `time`, which reaches back
     `window_frames`, does not need; then the oldest of the window. Without a limit, all that are
-    more than `WINDOW` frames before or after `time` go.
+    more than `WINDOW` frames before or after `time` go, or more than `window_frames` if it is longer.
 
     Returns:
         What was dropped of the window.
     """
     if memory_mb is None:
-        for far in [other for other in frames if abs(other - time) > WINDOW]:
+        reach = max(WINDOW, window_frames)
+        for far in [other for other in frames if abs(other - time) > reach]:
             del frames[far]
         return []
     window = range(time - window_frames, time)
