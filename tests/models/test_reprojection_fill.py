@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import torch
-from models.plates import Rig, camera, look, view
+from models.plates import Rig, camera, context, look, view
 
 from viewmend.models.base import Inpainter
 from viewmend.models.classical import ReprojectionFill
 from viewmend.models.smooth_fill import fill
+from viewmend.models.views.pyramids import SourceCameras
+from viewmend.types import Silhouettes
 
 
 def test_it_finds_the_true_colours_where_a_camera_sees_the_surface():
@@ -41,3 +43,14 @@ def test_without_cameras_it_fills_smoothly_and_without_holes_it_asks_nobody():
     rig.asked.clear()
     whole = view(5, hole=None)
     assert inpainter.step(whole, rig, inpainter.initial_state())[0].rgb is whole.rgb and not rig.asked
+
+
+def test_silhouettes_of_past_frames_are_their_own():
+    """The view has masks of its own frame, and its holes are filled from a past one."""
+    rig = Rig(silent=frozenset({("left", 5), ("right", 5)}))
+    now = context(5)
+    empty = Silhouettes(torch.zeros_like(now.frame.mask), now.frame.cameras)
+    inpainter = ReprojectionFill()
+    inpainter.step(replace(view(5), silhouettes=empty), rig, inpainter.initial_state())
+    past = SourceCameras.of(context(4), None, rig)
+    assert all(pyramid.mask_sum > 0 for pyramid in past.silhouette_pyramids)

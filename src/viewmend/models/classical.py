@@ -96,7 +96,8 @@ class ReprojectionFill(Fill):
             seen = context(time, nearest if time == view.time else view.source_views) if len(left) else None
             if seen is None:
                 continue
-            sources = SourceCameras.of(seen, view.silhouettes, context)
+            silhouettes = view.silhouettes if time == view.time else None  # those of another frame differ
+            sources = SourceCameras.of(seen, silhouettes, context)
             point = CameraFeatures.unstack(sample_behind_proxy(view, left, sources, offsets=(0.0,)).features)
             near = point.depth_difference.abs() < math.tanh(TOLERANCE / NEAR)
             visible = (point.in_view > 0) & (point.mask > 0.5) & near
