@@ -59,6 +59,9 @@ def completed(scene):
     return stream.mend(view).completed
 
 
+DEPTH_M = 2.0
+
+
 def later(completed, frames, crop=None):
     view = replace(completed.view, time=completed.view.time + frames)
     images = {"rgb": completed.rgb, "alpha": completed.alpha}
@@ -74,22 +77,22 @@ def brightened(completed):
 
 def test_only_predicted_pixels_of_later_views_change(completed):
     everywhere = torch.ones_like(completed.view.error, dtype=torch.bool)
-    first, last = steady(completed, everywhere, State())
+    first, last = steady(completed, everywhere, State(), DEPTH_M)
     assert first is completed and last.time == completed.view.time
     left = everywhere.clone()
     left[:, 48:] = False
     brighter = brightened(later(completed, 1))
-    after, _ = steady(brighter, left, last)
+    after, _ = steady(brighter, left, last, DEPTH_M)
     changed = (after.rgb != brighter.rgb).any(0)
     assert bool(changed.any()) and not bool((changed & ~(left & (brighter.view.error > 0))).any())
     for frames in (0, -1, 30):
-        kept, state = steady(brightened(later(completed, frames)), everywhere, last)
+        kept, state = steady(brightened(later(completed, frames)), everywhere, last, DEPTH_M)
         assert torch.equal(kept.rgb, brighter.rgb)
         assert state.time == completed.view.time + frames
 
 
 def test_a_view_of_another_side_is_not_used(completed):
-    _, last = steady(completed, completed.view.error > 0, State())
+    _, last = steady(completed, completed.view.error > 0, State(), DEPTH_M)
     camera = completed.view.camera
     turned = torch.eye(4)
     turned[:3, :3] = torch.from_numpy(cv2.Rodrigues(np.array([0.0, 0.3, 0.0]))[0]).float()
@@ -99,8 +102,26 @@ def test_a_view_of_another_side_is_not_used(completed):
     assert not last.precedes(camera.resized(48, 41), last.time + 1)
 
 
+def test_a_view_from_elsewhere_in_the_same_direction_is_not_used(completed):
+    _, last = steady(completed, completed.view.error > 0, State(), DEPTH_M)
+    camera = completed.view.camera
+
+    def moved(change):
+        return replace(camera, camera_from_world=change @ camera.camera_from_world)
+
+    for axis in (0, 1, 2):
+        step = torch.eye(4)
+        step[axis, 3] = 0.1 * DEPTH_M
+        assert last.precedes(moved(step), last.time + 1)
+        step[axis, 3] = 0.5 * DEPTH_M
+        assert not last.precedes(moved(step), last.time + 1)
+    roll = torch.eye(4)
+    roll[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    assert not last.precedes(moved(roll), last.time + 1)
+
+
 def test_crops_of_views_are_aligned(completed):
-    _, last = steady(completed, completed.view.error > 0, State())
+    _, last = steady(completed, completed.view.error > 0, State(), DEPTH_M)
     part = later(completed, 1, Crop(8, 4, 80, 70))
     placed = last.placed_in(part.view.camera)
     expected = torch.cat([part.rgb, part.alpha[None]]).permute(1, 2, 0).numpy()

@@ -354,7 +354,7 @@ class ViewSynthNet(Network):
         # In holes, the prediction is blended with the coarse fill, if `RayFill` has made it
         used_ray_fill = self.coarse is not None and not reduced_quality
         completed = prediction.composite_into(view, where, faded, filled if used_ray_fill else None)
-        steadied, new_state = steady(completed, where, state)
+        steadied, new_state = steady(completed, where, state, float(scale.depth_m))
         return opaque_in_mask(steadied), new_state
 
     def _depth_distribution(

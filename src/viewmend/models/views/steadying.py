@@ -35,7 +35,8 @@ MEAN_PX = 5
 MAX_GAP = 3
 """The last view is used if it is at most this many frames older."""
 MAX_TURN_DEG = 8.0
-"""The last view is used if the camera has turned by less than this angle, degrees."""
+"""The last view is used if the camera has turned, and moved as seen from the subject, by less than this
+angle, degrees."""
 MAX_ZOOM = 0.1
 """The last view is used if the focal length has changed by less than this share."""
 
@@ -49,6 +50,8 @@ class LastView(State):
     camera: Cameras
     time: int
     """Index of its frame."""
+    depth_m: float
+    """Median z-depth of its subject, metres."""
 
     def precedes(self, camera: Cameras, time: int) -> bool:
         """Whether a view of this camera at the frame `time` shows almost the same, a little later."""
@@ -56,9 +59,16 @@ class LastView(State):
             return False
         before = self.camera.on_host
         now = camera.on_host
-        cosine = float(before.world_from_camera[0, :3, 2] @ now.world_from_camera[0, :3, 2])
+        largest_rad = math.radians(MAX_TURN_DEG)
+        poses = (before.world_from_camera[0], now.world_from_camera[0])
+        turned = [float(poses[0][:3, axis] @ poses[1][:3, axis]) for axis in (0, 2)]
+        moved_m = float((poses[1][:3, 3] - poses[0][:3, 3]).norm())
         zoom = float(now.K[0, 0, 0] / before.K[0, 0, 0])
-        return cosine > math.cos(math.radians(MAX_TURN_DEG)) and abs(zoom - 1) < MAX_ZOOM
+        return (
+            min(turned) > math.cos(largest_rad)
+            and moved_m < math.tan(largest_rad) * self.depth_m
+            and abs(zoom - 1) < MAX_ZOOM
+        )
 
     def placed_in(self, camera: Cameras) -> Channels:
         """The image with its principal point where `camera` has it: both may be crops of larger views."""
@@ -69,11 +79,12 @@ class LastView(State):
 
 
 def steady(
-    completed: CompletedView, predicted: Bool[Tensor, "height width"], last: State
+    completed: CompletedView, predicted: Bool[Tensor, "height width"], last: State, depth_m: float
 ) -> tuple[CompletedView, LastView]:
     """A view whose predicted pixels flicker less than they did, and the viewer's next state.
 
-    Without a last view, or if it shows something else (`LastView.precedes`), the view is unchanged.
+    Without a last view, or if it shows something else (`LastView.precedes`), the view is unchanged. `depth_m`
+    is the median z-depth of its subject, metres.
     """
     view = completed.view
     assert completed.alpha is not None, "the model predicts alpha"
@@ -83,7 +94,7 @@ def steady(
         weight = view.error * predicted
         image = (image + weight * torch.from_numpy(change).to(image).permute(2, 0, 1)).clamp(0, 1)
         completed = replace(completed, rgb=image[:3], alpha=image[3])
-    return completed, LastView(image, view.camera, view.time)
+    return completed, LastView(image, view.camera, view.time, depth_m)
 
 
 def steadying_change(now: Channels, before: Channels) -> Channels:
