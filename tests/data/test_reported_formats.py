@@ -592,10 +592,11 @@ def test_a_capture_far_from_the_origin_is_computed_near_it(plain, offset):
         np.testing.assert_allclose(center, -one.R.T @ one.t_m + near.origin_m + np.array(offset), atol=1e-4)
 
 
-def test_cameras_too_far_for_32_bits_are_refused():
+@pytest.mark.parametrize("offset_m", [(4e5, 4.5e6, 200.0), (0.0, 5e3, 0.0)])
+def test_cameras_too_far_for_32_bits_are_refused(offset_m):
     cameras = ring(4)
     pose = cameras.camera_from_world.double()
-    pose[:, :3, 3] -= pose[:, :3, :3] @ torch.tensor([4e5, 4.5e6, 200.0], dtype=torch.float64)
+    pose[:, :3, 3] -= pose[:, :3, :3] @ torch.tensor(offset_m, dtype=torch.float64)
     far = replace(cameras, camera_from_world=pose.float())
     with pytest.raises(
         ValueError, match=r"near the world's origin, got a rig of .* subtract the rig's centre"
