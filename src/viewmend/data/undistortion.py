@@ -109,11 +109,7 @@ def _rows_of_map(
     x *= nearer
     y *= nearer
 
-    k1, k2, p1, p2, k3 = dist
-    square = x * x + y * y
-    radial = 1 + ((k3 * square + k2) * square + k1) * square
-    seen_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    seen_y = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    seen_x, seen_y = _distorted(x, y, dist)
     u = K[0, 0] * seen_x + K[0, 1] * seen_y + K[0, 2]
     v = K[1, 1] * seen_y + K[1, 2]
     # Farther outside, all pixels are the same, and numbers would be too large
@@ -121,6 +117,18 @@ def _rows_of_map(
     steps_y = np.rint(STEPS * v.clip(-1, height)).astype(np.int32)
     positions = np.stack([steps_x // STEPS, steps_y // STEPS], -1).astype(np.int16)
     return positions, (steps_y % STEPS * STEPS + steps_x % STEPS).astype(np.uint16), beyond
+
+
+def _distorted(
+    x: Float64[np.ndarray, "rows width"], y: Float64[np.ndarray, "rows width"], dist: Float64[np.ndarray, "5"]
+) -> tuple[Float64[np.ndarray, "rows width"], Float64[np.ndarray, "rows width"]]:
+    """Rays at depth 1 after the lens."""
+    k1, k2, p1, p2, k3 = dist
+    square = x * x + y * y
+    radial = 1 + ((k3 * square + k2) * square + k1) * square
+    distorted_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    distorted_y = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    return distorted_x, distorted_y
 
 
 def largest_radius(dist: Float64[np.ndarray, "5"]) -> float:
