@@ -276,6 +276,28 @@ def test_a_fixed_rig_of_several_times_needs_no_time(tmp_path, shift):
     assert capture.read(2).rgb[1, 0, 0, 0] == 10
 
 
+@pytest.mark.parametrize("timed", [False, True])
+def test_masks_of_transforms_have_the_numbers_of_their_images(tmp_path, timed):
+    content = films(tmp_path)
+    (tmp_path / "mask").mkdir()
+    for frame in content["frames"]:
+        frame["mask_path"] = frame["file_path"].replace("\\", "/").replace("image", "mask", 1)
+        cv2.imwrite(str(tmp_path / frame["mask_path"]), np.full((frame["h"], frame["w"]), 255, np.uint8))
+        if not timed:
+            frame.pop("time")
+    lost = content["frames"][4].pop("mask_path")
+    (tmp_path / lost).unlink()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = open_capture(tmp_path)
+    assert capture.has_masks and capture.gaps == (("c1", "0005"),)
+    content["frames"][4]["mask_path"] = lost.replace("0005", "5")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(
+        CaptureError, match="expected equal numbers in mask_path" if timed else "numbers of images in"
+    ):
+        open_capture(tmp_path)
+
+
 def test_images_that_transforms_do_not_mention_are_named(tmp_path, caplog):
     content = films(tmp_path, times=(0,))
     (tmp_path / "image").rename(tmp_path / "images")

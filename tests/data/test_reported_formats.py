@@ -401,6 +401,44 @@ def test_times_of_colmap_are_frames(tmp_path, layout, shift, binary):
         np.testing.assert_allclose(found[camera["name"]], -camera["R"].T @ camera["t"], atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("layout", "pattern"),
+    [("cam{camera:02d}/{time:02d}", "cam00/{frame}.png"), ("cam{camera}_{time}", "cam0_{frame}.png")],
+)
+def test_a_camera_with_one_image_keeps_its_number(tmp_path, layout, pattern):
+    rig = [camera | {"name": number} for camera, number in zip(rig_of(3), (0, 8, 16), strict=True)]
+    images = several_times(rig, layout)
+    write_flat_images(tmp_path, images)
+    write_colmap(tmp_path, opencv([one for number, one in enumerate(images) if number not in (0, 6)]))
+    assert len(open_capture(tmp_path).cameras) == 3
+    assert (f"images/{pattern}", f"masks/{pattern}") in [
+        (camera.image, camera.mask) for camera in read_any_calibration(tmp_path).cameras
+    ]
+
+
+@pytest.mark.parametrize("format", ["colmap", "middlebury", "agisoft"])
+def test_an_image_without_mask_is_left_out_if_others_have_one(tmp_path, caplog, format):
+    rig = rig_of(4)
+    write_images(tmp_path, rig)
+    if format == "colmap":
+        write_colmap(tmp_path, opencv(rig))
+    elif format == "middlebury":
+        write_middlebury(tmp_path / "rig_par.txt", opencv(rig))
+    else:
+        write_agisoft(tmp_path / "cameras.xml", opencv(rig))
+    for mask in (tmp_path / "masks").rglob("*.png"):
+        mask.unlink()
+    with pytest.raises(
+        CaptureError, match=r"masks/.*png\.png: .* expected the camera's mask in at least one frame"
+    ):
+        open_capture(tmp_path)
+    for camera in rig[1:]:
+        mask = np.full((camera["height"], camera["width"]), 255, np.uint8)
+        cv2.imwrite(str(tmp_path / camera["image"].replace("images", "masks", 1)), mask)
+    assert len(open_capture(tmp_path).cameras) == 3
+    assert "is not used: expected masks, which the other cameras have, got none; add them" in caplog.text
+
+
 def test_photos_of_none_of_the_moments_are_left_out_and_named(tmp_path, caplog):
     """Photos of the empty room help COLMAP to place a rig that was recorded at several times."""
     rig = rig_of(3)

@@ -19,7 +19,6 @@ from viewmend.data.formats.files import (
     IMAGE_SUFFIXES,
     existing,
     files_like,
-    find_mask,
     first_of,
     listed,
     names_from_paths,
@@ -29,7 +28,7 @@ from viewmend.data.formats.files import (
     xml_attributes,
     xml_number,
 )
-from viewmend.data.formats.moments import PosedImage, fixed_cameras
+from viewmend.data.formats.moments import PosedImage, fixed_cameras, with_masks
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**24
@@ -62,9 +61,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     used = existing(folder, used, paths.__getitem__)
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
     used = _with_calibration(file, used, sensors)
-    posed = [
-        _posed(folder, chunk, camera, paths[camera], sensors.get(camera.get("sensor_id"))) for camera in used
-    ]
+    posed = [_posed(chunk, camera, paths[camera], sensors.get(camera.get("sensor_id"))) for camera in used]
+    posed = with_masks(folder, posed)
     rig = fixed_cameras(posed)
     if rig is not None:
         cameras, frames = rig
@@ -93,12 +91,11 @@ def _choose_chunk(file: Path) -> Element:
     return largest
 
 
-def _posed(folder: Path, chunk: Element, camera: Element, image: str, sensor: Element | None) -> PosedImage:
-    """A photo with its lens, its pose and its mask."""
+def _posed(chunk: Element, camera: Element, image: str, sensor: Element | None) -> PosedImage:
+    """A photo with its lens and its pose."""
     label = camera.get("label", "")
     R, center = _pose(label, camera, chunk)
-    mask = find_mask(folder, image.removeprefix("images/"))
-    return PosedImage(image, mask, _lens(label, sensor), R, center)
+    return PosedImage(image, None, _lens(label, sensor), R, center)
 
 
 def _used_cameras(chunk: Element) -> list[Element]:

@@ -14,12 +14,11 @@ from jaxtyping import Float64
 from viewmend.data.formats.files import (
     decode_text,
     existing,
-    find_mask,
     folders_containing,
     names_from_paths,
     warn_of_unused_images,
 )
-from viewmend.data.formats.moments import PosedImage, fixed_cameras
+from viewmend.data.formats.moments import PosedImage, fixed_cameras, with_masks
 from viewmend.utils.untrusted_input import bounded_bytes
 
 IMAGES = "images.txt"
@@ -109,9 +108,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
             raise ValueError(f"expected {expected}, got none; export the model again")
         R = _rotation(view)
         t = np.array(view.t)
-        images.append(
-            PosedImage(prefix + view.name, find_mask(folder, view.name), lenses[view.camera], R, -R.T @ t)
-        )
+        images.append(PosedImage(prefix + view.name, None, lenses[view.camera], R, -R.T @ t))
+    images = with_masks(folder, images)
     rig = fixed_cameras(images)
     if rig is not None:
         cameras, frames = rig

@@ -211,11 +211,10 @@ def _count_shared(texts: Sequence[str]) -> int:
 
 
 def find_mask(folder: Path, image: str) -> str | None:
-    """The path of an image's mask in `masks`: `a.jpg.png`, as in COLMAP, or `a.png`; None without that folder."""
-    if not (folder / "masks").is_dir():
-        return None
-    replaced = stored_path(folder, f"masks/{image.rpartition('.')[0]}.png")
-    return replaced if (folder / replaced).is_file() else f"masks/{image}.png"
+    """The path of an image's mask in `masks`: `a.png`, or `a.jpg.png`, as in COLMAP; None without such a file."""
+    names = (image.rpartition(".")[0], image)
+    paths = [stored_path(folder, f"masks/{name}.png") for name in names]
+    return next((path for path in paths if (folder / path).is_file()), None)
 
 
 def to_rotation(name: str, values: object) -> list[list[float]]:

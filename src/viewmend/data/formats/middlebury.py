@@ -12,13 +12,12 @@ import numpy as np
 from viewmend.data.formats.files import (
     decode_text,
     files_like,
-    find_mask,
     first_of,
     image_size_px,
     names_from_paths,
     warn_of_unused_images,
 )
-from viewmend.data.formats.moments import PosedImage, fixed_cameras
+from viewmend.data.formats.moments import PosedImage, fixed_cameras, with_masks
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**22
@@ -43,6 +42,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         expected = f"a count, then that many lines of a name and {NUMBERS} numbers"
         raise ValueError(f"expected {expected}, got {got}; copy it again")
     posed = [_posed(folder, words[0], [float(word) for word in words[1:]]) for words in lines[1:]]
+    posed = with_masks(folder, posed)
     warn_of_unused_images(folder, [image.path for image in posed])
     rig = fixed_cameras(posed)
     if rig is not None:
@@ -62,4 +62,4 @@ def _posed(folder: Path, name: str, numbers: list[float]) -> PosedImage:
     K, R = np.array(numbers[:18]).reshape(2, 3, 3)
     t = np.array(numbers[18:])
     lens = {"width": width, "height": height, "K": K.tolist()}
-    return PosedImage(place + name, find_mask(folder, name), lens, R, -np.linalg.solve(R, t))
+    return PosedImage(place + name, None, lens, R, -np.linalg.solve(R, t))

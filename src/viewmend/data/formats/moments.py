@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
-from pathlib import PurePosixPath
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from viewmend.data.formats.files import frame_order, frame_pattern, listed, names_of_patterns, warn
+from viewmend.data.formats.files import find_mask, frame_order, frame_pattern, listed, names_of_patterns, warn
 
 POSE_DIGITS = 6
 """Poses that are equal to this many decimals are those of one camera."""
@@ -43,7 +43,7 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
 
     Raises:
         ValueError: two images have the same pose, but their names do not tell which images belong
-            to one moment.
+            to one moment; or masks have other numbers than their images.
     """
     groups = _by_pose(images) or _by_name(images)
     if groups is None:
@@ -53,13 +53,18 @@ def fixed_cameras(images: Sequence[PosedImage]) -> tuple[list[dict[str, Any]], t
     groups = _without_strangers(images, groups, ids)
     patterns = [_pattern([images[index].path for index in group]) for group in groups]
     _check_moments(patterns, ids)
-    paths = [_completed(pattern, ids) for pattern, _ in patterns]
+    shapes = {_shape(pattern) for pattern, found in patterns if found}
+    patterns = [
+        (pattern, found) if found else _completed(pattern, ids, shapes) for pattern, found in patterns
+    ]
+    names = names_of_patterns([pattern for pattern, _ in patterns])
     cameras = []
-    for name, group, path in zip(names_of_patterns(paths), groups, paths, strict=True):
-        masks = [mask for index in group if (mask := images[index].mask) is not None]
-        mask = _completed(_pattern(masks)[0], ids) if len(masks) == len(group) else None
-        pose = _mean_pose([images[index] for index in group])
-        cameras.append({"name": name, **images[group[0]].lens, **pose, "image": path, "mask": mask})
+    for name, group, (pattern, found) in zip(names, groups, patterns, strict=True):
+        own = [images[index] for index in group]
+        mask = _mask_pattern(
+            [(image.mask, frame) for image, frame in zip(own, found, strict=True) if image.mask]
+        )
+        cameras.append({"name": name, **own[0].lens, **_mean_pose(own), "image": pattern, "mask": mask})
     return cameras, tuple(ids)
 
 
@@ -71,7 +76,9 @@ def _without_strangers(
     Such photos only help a reconstruction. All groups are kept if fewer than two would be.
     """
     strangers = [
-        group for group in groups if len(group) == 1 and _complete(images[group[0]].path, ids) is None
+        group
+        for group in groups
+        if len(group) == 1 and not any(_with_frame(images[group[0]].path, frame) for frame in ids)
     ]
     if not strangers or len(groups) - len(strangers) < 2:
         return groups
@@ -162,22 +169,55 @@ def _pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     return frame_pattern(paths)
 
 
-def _completed(pattern: str, ids: Sequence[str]) -> str:
-    """The pattern of a single path, by the frame id that it contains; ValueError if it contains none."""
-    completed = _complete(pattern, ids)
-    if completed is None:
+def _completed(path: str, ids: Sequence[str], shapes: set[str]) -> tuple[str, tuple[str]]:
+    """The pattern of a single path and the frame id that it contains; ValueError if it contains none.
+
+    An id may also be in the camera's part of the path. Of several places, the one that gives a pattern of
+    one of these shapes counts, or else the last one.
+    """
+    found = [(pattern, frame) for frame in ids for pattern in _with_frame(path, frame)]
+    if not found:
         raise ValueError(
-            f"expected a frame id such as {ids[0]} in {pattern}, got another name; rename the image"
+            f"expected a frame id such as {ids[0]} in {path}, got another name; rename the image"
         )
-    return completed
+    pattern, frame = max(found, key=lambda one: (_shape(one[0]) in shapes, one[0].index("{frame}")))
+    return pattern, (frame,)
 
 
-def _complete(pattern: str, ids: Sequence[str]) -> str | None:
-    """The pattern of a single path, by the frame id that it contains; None if it contains none."""
-    if "{frame}" in pattern:
-        return pattern
-    for frame in sorted(ids, key=len, reverse=True):
-        before, found, after = pattern.rpartition(frame)
-        if found:
-            return f"{before}{{frame}}{after}"
-    return None
+def _mask_pattern(masks: Sequence[tuple[str, str]]) -> str | None:
+    """The pattern of a camera's masks, given with their images' frame ids; None without masks.
+
+    ValueError if they do not have these ids at the same place of their names.
+    """
+    found = [_with_frame(path, frame) for path, frame in masks]
+    shared = [pattern for pattern in found[0] if all(pattern in own for own in found)] if found else []
+    if masks and not shared:
+        path, frame = masks[0]
+        raise ValueError(
+            f"expected the numbers of images in the names of their masks, got {path} for frame {frame}; rename "
+            "the masks as the images"
+        )
+    return shared[-1] if shared else None
+
+
+def _with_frame(path: str, frame: str) -> list[str]:
+    """The patterns that give this path for a frame id, one for each place where it has the id."""
+    places = re.finditer(rf"(?<!\d){re.escape(frame)}(?!\d)", path)
+    return [f"{path[: place.start()]}{{frame}}{path[place.end() :]}" for place in places]
+
+
+def _shape(pattern: str) -> str:
+    """A pattern without the numbers of its camera."""
+    return re.sub(r"\d+", "0", pattern)
+
+
+def with_masks(folder: Path, images: Sequence[PosedImage]) -> list[PosedImage]:
+    """The images with their masks in the folder `masks`, as `find_mask` finds them.
+
+    If no image has one, all get the path that was expected, which the message about missing files names.
+    """
+    names = [image.path.removeprefix("images/") for image in images]
+    masks = [find_mask(folder, name) for name in names]
+    if not any(masks) and (folder / "masks").is_dir():
+        masks = [f"masks/{name}.png" for name in names]
+    return [replace(image, mask=mask) for image, mask in zip(images, masks, strict=True)]

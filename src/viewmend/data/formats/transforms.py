@@ -243,10 +243,10 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
         entries = list(at_pose.values())
         patterns = {}
         for key in ("file_path", "mask_path", "depth_file_path"):
-            paths = [path for entry in entries if (path := getattr(entry, key))]
-            pattern, found = frame_pattern(paths) if len(paths) == len(entries) else (None, ())
+            paths = {time: path for time, entry in at_pose.items() if (path := getattr(entry, key))}
+            pattern, found = frame_pattern(list(paths.values())) if len(paths) > 1 else (None, ())
             patterns[key] = pattern
-            if any(ids.setdefault(time, name) != name for time, name in zip(at_pose, found, strict=False)):
+            if any(ids.setdefault(time, name) != name for time, name in zip(paths, found, strict=False)):
                 raise ValueError(
                     f"expected equal numbers in {key} for equal 'time', got others; rename the files"
                 )
