@@ -159,6 +159,8 @@ def of_cameras(**fields):
         ),
         (of_cameras(size_px=TALL), r"rgb of shape \(3, 3, 20, 16\).*got \(3, 3, 16, 16\)"),
         (RIG.select([]), "expected at least one camera, got none"),
+        (forged(RIG, time=0.033), "expected time as a whole number, the frame's index, got 0.033; count"),
+        (forged(RIG, time=torch.tensor(3)), "expected time as a whole number, .*, got tensor"),
     ],
 )
 def test_frames_of_wrong_types_or_sizes_are_refused(frame, message):

@@ -145,6 +145,10 @@ class MultiViewFrame(_LazyStacks, OnDevice):
 
         Masks, or images if there are none, may not have content beyond the cameras' size_px.
         """
+        if isinstance(self.time, Tensor) or not hasattr(self.time, "__index__"):
+            raise ValueError(
+                f"expected time as a whole number, the frame's index, got {self.time!r}; count the frames"
+            )
         self.cameras.check()
         width, height = self.cameras.max_size_px
         convert = "scale it to 0 to 255, and convert it with .byte()"

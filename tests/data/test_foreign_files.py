@@ -1,6 +1,7 @@
 """Files as other tools and systems write them: what they mean is understood, or refused by its name."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 from reference.films import write_film
 from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
-from reference.foreign_rigs import write_toml
+from reference.foreign_rigs import write_opencv, write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
 from viewmend.data.capture_folder import open_capture
@@ -607,3 +608,38 @@ def test_a_pattern_has_all_digits_of_the_frame():
     for paths in (["a/1.png", "b/2.png"], ["a1/1.png", "a2/2.png"]):
         with pytest.raises(ValueError, match="expected paths that differ in a number"):
             frame_pattern(paths)
+
+
+def test_a_size_of_minus_one_is_unknown_to_easymocap(tmp_path):
+    names = mocap(tmp_path, [["000"]] * 3)
+    file = tmp_path / "intri.yml"
+    file.write_text(re.sub(r"([HW]_\w+:) \d+", r"\1 -1.", file.read_text()))
+    assert open_capture(tmp_path).cameras.names == tuple(names)
+
+
+def test_a_fisheye_lens_of_opencv_is_refused(tmp_path):
+    rig = random_rig(5, 3)
+    write_images(tmp_path, rig)
+    write_opencv(tmp_path, opencv(rig), style="files")
+    for camera in rig:
+        place = tmp_path / "images" / camera["name"]
+        place.mkdir()
+        (tmp_path / camera["image"]).rename(place / "000.png")
+    for file in sorted((tmp_path / "masks").rglob("*.png")):
+        file.unlink()
+    (tmp_path / "masks").rmdir()
+    for file in (tmp_path / "calib").iterdir():
+        file.write_text(file.read_text() + "fisheye_model: 1\n")
+    (tmp_path / "calib" / "large.xml").write_bytes(b"<opencv>" + b" " * 2**21)
+    with pytest.raises(CaptureError, match="got fisheye_model; undistort the images first"):
+        open_capture(tmp_path)
+
+
+def test_names_of_colmap_are_in_utf8(tmp_path):
+    rig = random_rig(5, 3)
+    write_colmap(tmp_path, opencv(rig))
+    file = tmp_path / "sparse/0/images.bin"
+    name = rig[0]["image"].removeprefix("images/").encode()
+    file.write_bytes(file.read_bytes().replace(name, b"\xe4" + name[1:]))
+    with pytest.raises(CaptureError, match=r"expected the names in images\.bin in UTF-8"):
+        open_capture(tmp_path)

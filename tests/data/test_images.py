@@ -1,5 +1,6 @@
 """Image files: exact decoding, and untrusted data that are rejected without allocating what they claim."""
 
+import inspect
 import struct
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from viewmend.data.images import (
     read_mask,
     read_rgb,
     read_run_lengths,
+    write_image,
 )
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
@@ -113,3 +115,12 @@ def test_invalid_run_lengths_are_rejected(tmp_path, runs, extra):
     (tmp_path / "a.bin").write_bytes(np.array(runs, "<i4").tobytes() + extra)
     with pytest.raises(CaptureError, match="expected runs of 0 and 1 that end at 4 x 3 = 12 pixels"):
         read_run_lengths(tmp_path / "a.bin", "a.bin: camera '1'", (3, 4))
+
+
+@pytest.mark.parametrize("image", [IMAGE / 255, IMAGE > 0, IMAGE[..., :1], IMAGE.tolist()])
+def test_only_images_of_8_bit_are_written(image, tmp_path):
+    write_image(str(tmp_path / "right.png"), IMAGE)
+    assert np.array_equal(read_rgb(tmp_path / "right.png", "right"), IMAGE)
+    unchecked = inspect.unwrap(write_image)  # types are checked in some runs of the tests
+    with pytest.raises(ValueError, match=r"expected a numpy array of uint8 .*; convert values in"):
+        unchecked(tmp_path / "wrong.png", image)

@@ -302,11 +302,11 @@ def _is_complete(data: bytes) -> bool:
     return True
 
 
-def write_image(path: Path, image: UInt8[np.ndarray, "height width *channel"]) -> None:
+def write_image(path: Path | str, image: UInt8[np.ndarray, "height width *channel"]) -> None:
     """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
 
     Raises:
-        ValueError: the suffix is that of no image format.
+        ValueError: the suffix is that of no image format, or the image is not of 8 bit.
         OSError: the file cannot be written.
 
     Examples:
@@ -319,6 +319,14 @@ def write_image(path: Path, image: UInt8[np.ndarray, "height width *channel"]) -
         ...     (Path(folder) / "black.png").is_file()
         True
     """
+    path = Path(path)
+    shape = getattr(image, "shape", ())
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or shape[2:] not in ((), (3,), (4,)):
+        got = f"{type(image).__name__} of {getattr(image, 'dtype', 'no type')} and shape {tuple(shape)}"
+        raise ValueError(
+            f"expected a numpy array of uint8 and shape (height, width), with 3 or 4 channels last, got {got}; convert "
+            "values in [0, 1] with (255 * image).round().astype(np.uint8)"
+        )
     # No chroma subsampling (4:4:4), which would blur coloured edges.
     jpeg = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
     options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)

@@ -181,7 +181,7 @@ def _binary_images(data: bytes) -> list[ColmapImage]:
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.find(b"\0", at + 64)
-        name = data[at + 64 : end].decode()
+        name = decode_text(data[at + 64 : end], "the names in images.bin")
         at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
         if end < 0 or at > len(data):
             raise IndexError

@@ -39,7 +39,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         K = _matrix(intrinsics, f"K_{name}", 9).reshape(3, 3)
         W = intrinsics.get(f"W_{name}")
         H = intrinsics.get(f"H_{name}")
-        size = (W, H) if isinstance(W, float) and isinstance(H, float) and W and H else None
+        size = (W, H) if isinstance(W, float) and isinstance(H, float) and W > 0 and H > 0 else None
         dist = next(
             (intrinsics[key] for key in (f"dist_{name}", f"D_{name}") if key in intrinsics), np.zeros(5)
         )

@@ -53,7 +53,13 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     footage = find_footage(folder, [name for name, _ in cameras])
     entries = []
     for name, path in ((name, path) for name, path in cameras if name in footage):
-        values = _values(read_storage(path))
+        stored = read_storage(path)
+        fisheye = [key for key in stored if "fisheye" in key.lower() and np.any(stored[key])]
+        if fisheye:
+            raise ValueError(
+                f"camera '{name}': expected a lens with k1 k2 p1 p2 k3, got {fisheye[0]}; undistort the images first"
+            )
+        values = _values(stored)
         W = values.get("width")
         H = values.get("height")
         size = (float(W), float(H)) if isinstance(W, int | float) and isinstance(H, int | float) else None
@@ -79,12 +85,16 @@ def _complete_files(place: Path) -> list[Path]:
     files = [path for path in files_like(place, "*.*") if path.suffix.lower() in SUFFIXES]
     complete = []
     invalid = []
-    for path in (path for path in files if b"opencv" in bounded_bytes(path, MAX_BYTES)):
+    for path in (path for path in files if path.stat().st_size <= MAX_BYTES):
         try:
+            if b"opencv" not in bounded_bytes(path, MAX_BYTES):
+                continue
             if {"K", "R", "t"} <= _values(read_storage(path)).keys():
                 complete.append(path)
         except ValueError:
             invalid.append(path)
+        except OSError:  # unreadable files are none of this format
+            continue
     return complete or invalid
 
 
