@@ -34,6 +34,13 @@ def test_help_and_mistakes_import_nothing_heavy(arguments):
     assert done.stderr.splitlines()[-1] == f"{0 if '--help' in arguments else 2} set()"
 
 
+def test_a_folder_of_the_user_may_follow_an_equals_sign(monkeypatch):
+    monkeypatch.setenv("HOME", "/somewhere")
+    seen = []
+    assert run_command(monkeypatch, seen.append, ["--out=~/a~/b.png"]) == 0
+    assert str(seen[0].out) == "/somewhere/a~/b.png"
+
+
 def raising(error):
     def run(options):
         raise error

@@ -44,6 +44,13 @@ def test_frames_are_read(plain):
             capture.read(time)
 
 
+def test_files_of_captures_and_folders_of_users_are_understood(plain, monkeypatch):
+    with pytest.raises(CaptureError, match=r"got the file .*\.png; open its folder, .*images"):
+        open_capture(sorted((plain.path / "images").iterdir())[0])
+    monkeypatch.setenv("HOME", str(plain.path.parent))
+    assert len(open_capture(f"~/{plain.path.name}").cameras) == 4
+
+
 def test_cameras_can_be_selected(plain):
     assert open_capture(plain.path / "cameras.json", ["c", "a"]).read(1).cameras.names == ("c", "a")
     with pytest.raises(CaptureError, match=r"among \['a', 'b', 'c', 'd'\], each once, got \['e'\]"):

@@ -17,6 +17,7 @@ import importlib
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from viewmend import __version__
 from viewmend.cli.console import escape_unencodable, exit_on_sigterm, say, show, use_utf8_names
@@ -78,6 +79,8 @@ def _dispatch(arguments: list[str]) -> int:
     log_to_terminal()
     import tyro
 
+    # Shells expand ~ only at the beginning of a word
+    arguments = [re.sub(r"^(--[\w-]+=)?~(?=/|$)", _with_home, word) for word in arguments]
     arguments = arguments[len(command.split()) :]
     module = importlib.import_module(f"viewmend.cli.{re.sub('[ -]', '_', command)}")
     prog = f"viewmend {command}"
@@ -87,6 +90,11 @@ def _dispatch(arguments: list[str]) -> int:
     else:
         options = tyro.cli(module.Options, args=arguments, prog=prog, config=flags)
     return int(module.run(options) or 0)
+
+
+def _with_home(start: re.Match[str]) -> str:
+    """The option before a `~`, if any, and the user's folder."""
+    return (start.group(1) or "") + str(Path.home())
 
 
 def _run(arguments: list[str]) -> int:

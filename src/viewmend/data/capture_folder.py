@@ -73,7 +73,7 @@ def open_capture(
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 64, 64])
     """
-    capture = CaptureFolder(Path(path), cameras, format, masks)
+    capture = CaptureFolder(Path(path).expanduser(), cameras, format, masks)
     for issue in capture.issues:
         logging.getLogger("viewmend").warning("%s: %s", capture.name, issue.text)
     return capture

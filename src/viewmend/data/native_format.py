@@ -179,6 +179,10 @@ def read_calibration(folder: Path) -> NativeCalibration:
             if folder.is_dir()
             else "there is no such folder"
         )
+        if folder.is_file():
+            raise CaptureError(
+                f"expected a capture folder, got the file {folder}; open its folder, {folder.parent}"
+            )
         raise CaptureError(f"expected a capture folder with {path}, but {got}; check the path")
     try:
         content = typed(read_json(bounded_bytes(path)), dict[str, Any], "see docs/capture-format.md")
