@@ -241,6 +241,26 @@ def test_poses_come_from_a_file(folder, tmp_path, mend):
     assert cv2.imread(str(tmp_path / "out" / "holes" / "000002.png"), 0).shape == (20, 40)
 
 
+def test_a_recorded_path_plays_the_frames_it_was_recorded_with(folder, tmp_path, mend):
+    poses = [camera_at(angle, "t").world_from_camera[0].tolist() for angle in (30, 60, 80, 90)]
+    file = tmp_path / "path.json"
+    content = {"world_from_camera": poses, "width": 40, "height": 20, "fps": 30, "times": [1, 1, 0, 1]}
+    file.write_text(json.dumps(content))
+    code, report, _ = mend(folder, tmp_path / "out", "--path", file, "--model", "telea")
+    assert code == 0 and report["frames"] == 4
+    with av.open(str(tmp_path / "out" / "completed.mp4")) as film:
+        assert film.streams.video[0].average_rate == 30
+    alone = tmp_path / "alone.json"
+    alone.write_text(json.dumps(content | {"world_from_camera": poses[1:2], "times": [1]}))
+    assert mend(folder, tmp_path / "one", "--path", alone, "--model", "telea")[0] == 0
+    second = pictures(tmp_path / "out" / "rendered")[1]
+    assert np.array_equal(pictures(tmp_path / "one" / "rendered")[0], second)
+    assert (
+        mend(folder, tmp_path / "none", "--path", file, "--frames", "0:1", "--model", "telea")[1]["frames"]
+        == 4
+    )
+
+
 def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):
     prepared = prepare(open_masked(shifted))
     camera = prepared.cameras[0]

@@ -328,6 +328,27 @@ def test_images_and_masks_may_be_videos(plain):
     )
 
 
+def test_frames_that_are_not_listed_are_those_of_the_footage(plain):
+    """As of the calibration that a board gives, which is copied next to any footage."""
+    del plain.description["frames"]
+    plain.save()
+    assert open_capture(plain.path).frame_ids == ("000", "001")
+    update(plain, image="missing/{frame}.png")
+    with pytest.raises(CaptureError, match="expected 'frames', or the cameras' videos or numbered images"):
+        open_capture(plain.path)
+    for view, name in enumerate("abcd"):
+        update(plain, view, image=f"{name}/{{frame}}.png", mask=None)
+        for frame in range(3 + (view == 1)):
+            plain.put(f"{name}/{frame:04d}.png", np.zeros((32, 40, 3), np.uint8))
+    capture = open_capture(plain.path)
+    assert capture.frame_ids == ("0000", "0001", "0002", "0003") and capture.present.sum() == 13
+    for view, name in enumerate("abcd"):
+        plain.put_video(f"{name}.avi", [np.zeros((32, 40, 3), np.uint8)] * (5 + view))
+        update(plain, view, video=f"{name}.avi", image=None)
+    assert len(open_capture(plain.path).frame_ids) == 5, "videos end with the shortest"
+    assert len(open_capture(plain.path, cameras=["b", "c"]).frame_ids) == 6
+
+
 @pytest.mark.parametrize(("stated", "expected"), [(None, 25), (25.1, 25.1), (30, 25)])
 def test_the_rate_is_that_of_the_videos(plain, stated, expected):
     for view, name in enumerate("abcd"):

@@ -81,9 +81,7 @@ def test_cameras_are_found_and_written(filmed, tmp_path, capsys):
         f["rms_px"] < 0.3 and f["images"] > 5 for f in figures.values()
     )
     calibration = read_calibration(out)
-    assert (
-        calibration.cameras[1].image == f"{rig.names[1]}/{{frame}}.png" and len(calibration.frames) == TIMES
-    )
+    assert calibration.cameras[1].image == f"{rig.names[1]}/{{frame}}.png"
     assert over_the_stage_px(pinhole_cameras(calibration.cameras), rig).mean() < 1.0
     baseline_m = np.linalg.norm(calibration.cameras[1].t_m)
     assert baseline_m == pytest.approx(float((rig.centers[1] - rig.centers[0]).norm()), rel=0.005)

@@ -94,7 +94,8 @@ def _by_board(options: Options, out: Path) -> Figures:
     )
     up: Any = -sum(camera.R[1] for camera in cameras)
     out.mkdir()
-    write_calibration(out, replace(footage, cameras=cameras, up=up))
+    # The footage that this calibration is for has other frames than that of the board
+    write_calibration(out, replace(footage, cameras=cameras, up=up, frames=()))
     write_image(out / "residuals.png", draw_residuals(cameras, found))
     images = [sum(view == number for view, _ in seen) for number in range(len(cameras))]
     return {

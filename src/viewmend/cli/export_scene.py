@@ -118,6 +118,6 @@ def _views(
     from viewmend.geometry.proxy import GeometryProxy
 
     if options.path is not None:
-        return read_camera_path(options.path, capture.cameras, origin_of(capture), full_size_px)
+        return read_camera_path(options.path, capture.cameras, origin_of(capture), full_size_px).cameras
     assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
     return place_around(capture.cameras, first.proxy.center, capture.up, options.views)

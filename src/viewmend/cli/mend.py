@@ -11,7 +11,7 @@ from viewmend.cli.checks import Geometry, Precision, PreparationOptions, ViewOpt
 from viewmend.utils.options import FLAT
 
 if TYPE_CHECKING:
-    from viewmend.data.camera_path import Turntable
+    from viewmend.data.camera_path import CameraPath, Turntable
     from viewmend.data.capture_folder import CaptureFolder
     from viewmend.data.prepare import PreparedCapture
     from viewmend.data.source import CaptureSource
@@ -71,8 +71,9 @@ class Options:
     """'orbit' circles the subject with its whole motion in view; options may follow, as in
     orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON
     file with a list of 4x4 world_from_camera matrices (metres, OpenCV axes), or with an
-    object of "world_from_camera" and optionally "K", "width" and "height"; one pose per
-    frame, or one for all."""
+    object of "world_from_camera" and optionally "K", "width", "height", "times" (the frame
+    of each pose) and "fps", as the live page saves it. Without "times", one pose per
+    frame, or one for all. A single frame (--frames 0:1) is shown from all poses."""
     cameras: tuple[str, ...] = ()
     """Names of the input cameras; all by default."""
     format: str | None = None
@@ -123,7 +124,7 @@ def run(options: Options) -> int:
     """Run the command; returns the exit code."""
     _check(options)
     from viewmend.cli.checks import chosen_times, load_named
-    from viewmend.data.camera_path import STATIC_FPS, parse_turntable
+    from viewmend.data.camera_path import STATIC_FPS, pair_with_frames, parse_turntable
     from viewmend.mending import MendSummary, default_protocol
     from viewmend.utils.heap import configure_allocator
 
@@ -138,7 +139,7 @@ def run(options: Options) -> int:
     usable = _find_usable_frames(opened, times, held)
     full_size_px = opened.cameras[0].max_size_px
     if options.path is not None and turntable is None:
-        _read_poses(options, opened, times, full_size_px)
+        pair_with_frames(_read_path(options, opened, full_size_px), times)
     inpainter = load_named(options.model, options.device, options.precision)
     protocol = options.protocol or default_protocol(inpainter)
     capture = _prepare(options, opened, held, usable)
@@ -147,8 +148,8 @@ def run(options: Options) -> int:
     mender = _make_mender(options, render, inpainter, capture.bounds, held, protocol)
     if turntable is not None and turntable.background:
         mender.background = turntable.background
-    plan = _plan(options, capture, times, usable, turntable, full_size_px)
-    fps = (turntable.fps if turntable else None) or capture.fps or STATIC_FPS
+    plan, planned_fps = _plan(options, capture, times, usable, turntable, full_size_px)
+    fps = planned_fps or capture.fps or STATIC_FPS
     summary = MendSummary(protocol)
     _mend_views(options, mender, capture, plan, fps, summary)
     _report(options, capture, plan, summary)
@@ -347,29 +348,31 @@ def _plan(
     usable: list[int],
     turntable: "Turntable | None",
     full_size_px: tuple[int, int],
-) -> "list[tuple[int, Cameras]]":
-    """The frame and the camera of each view, in order; without views of frames that are not usable."""
+) -> "tuple[list[tuple[int, Cameras]], float | None]":
+    """The frame and the camera of each view, in order, and the views per second that --path asks for, if any.
+
+    Views of frames that are not usable are left out.
+    """
+    from viewmend.data.camera_path import pair_with_frames
+
     if options.leave_out is not None:
-        return [(time, capture.cameras.select([options.leave_out])) for time in usable]
+        return [(time, capture.cameras.select([options.leave_out])) for time in usable], None
     if turntable is not None:
-        return _circle(turntable, capture, usable)
-    poses = _read_poses(options, capture, times, full_size_px)
-    return [(time, pose) for time, pose in poses if time in usable]
+        return _circle(turntable, capture, usable), turntable.fps
+    path = _read_path(options, capture, full_size_px)
+    return [(time, camera) for time, camera in pair_with_frames(path, times) if time in usable], path.fps
 
 
-def _read_poses(
-    options: Options, capture: "CaptureSource", times: range, full_size_px: tuple[int, int]
-) -> "list[tuple[int, Cameras]]":
-    """The frames with the poses in the file of --path; `full_size_px` is the first camera's, before --scale.
+def _read_path(options: Options, capture: "CaptureSource", full_size_px: tuple[int, int]) -> "CameraPath":
+    """Read the file of --path; `full_size_px` is the first camera's, before --scale.
 
     Raises:
-        ValueError: the file has other content, or another number of poses.
+        ValueError: the file has other content.
     """
-    from viewmend.data.camera_path import pair_with_frames, read_camera_path
+    from viewmend.data.camera_path import read_camera_path
     from viewmend.data.capture_folder import origin_of
 
-    path = read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture), full_size_px)
-    return pair_with_frames(path, times)
+    return read_camera_path(Path(str(options.path)), capture.cameras, origin_of(capture), full_size_px)
 
 
 def _circle(

@@ -1,6 +1,7 @@
 """Camera paths: reading poses from a JSON file, turntables, and pairing poses with frames."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,6 +31,10 @@ class PathFile(Struct, frozen=True):
     K: tuple[Triple, Triple, Triple] | None = None
     width: Pixels | None = None
     height: Pixels | None = None
+    times: tuple[Annotated[int, Meta(ge=0)], ...] | None = None
+    """Index of the capture's frame that each pose shows."""
+    fps: Annotated[float, Meta(ge=1, le=240)] | None = None
+    """Poses per second of the film."""
 
     def __post_init__(self) -> None:
         poses = torch.tensor(self.world_from_camera)
@@ -44,6 +49,22 @@ class PathFile(Struct, frozen=True):
             raise ValueError(f"expected 'K' as {expected}, got {shown(self.K)}; correct it")
         if (self.width is None) != (self.height is None):
             raise ValueError("expected both 'width' and 'height', got one of them; write both or neither")
+        if self.times is not None and len(self.times) != len(self.world_from_camera):
+            got = f"{len(self.times)} for {len(self.world_from_camera)} poses"
+            raise ValueError(
+                f"expected one of 'times' for each pose, got {got}; correct them or leave them out"
+            )
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The cameras of a file of poses, with what the file says of frames and rate."""
+
+    cameras: Cameras
+    times: tuple[int, ...] | None
+    """Index of the frame that each camera shows; None if the file does not say."""
+    fps: float | None
+    """Views per second of the film; None if the file does not say."""
 
 
 def read_camera_path(
@@ -51,13 +72,13 @@ def read_camera_path(
     like: Cameras,
     origin_m: Float64[np.ndarray, "3"] | None = None,
     full_size_px: tuple[int, int] | None = None,
-) -> Cameras:
+) -> CameraPath:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
     with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
-    0.5), "width" and "height". `origin_m` is the origin of `like` in the coordinates of the capture's
-    files (`origin_of`). Poses that are nearer to it than to 0 are taken to be in those coordinates.
+    0.5), "width" and "height", "times" (the frame of each pose) and "fps". `origin_m` is the origin of `like`
+    in the coordinates of the capture's files (`origin_of`). Poses that are nearer to it than to 0 are taken to be in those coordinates.
     `full_size_px` is the size of the first camera's images if those of `like` are reduced: what the
     file says of intrinsics and size is for unreduced images, and views are reduced if it says no size.
     ValueError if the file has other content.
@@ -88,7 +109,9 @@ def read_camera_path(
     size = full.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
     names = tuple(f"view{n:03d}" for n in range(count))
     cameras = Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
-    return cameras.resized(*first.max_size_px) if reduced and path.width is None else cameras
+    if reduced and path.width is None:
+        cameras = cameras.resized(*first.max_size_px)
+    return CameraPath(cameras, path.times, path.fps)
 
 
 class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -140,11 +163,25 @@ def parse_turntable(text: str) -> Turntable | None:
         raise ValueError(f"--path {text}: {error}") from None
 
 
-def pair_with_frames(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
-    """Frames with poses: one from every pose, or each from its own or a single one; ValueError for other counts."""
+def pair_with_frames(path: CameraPath, times: Sequence[int]) -> list[tuple[int, Cameras]]:
+    """The frame and the camera of each view of a film of the frames `times`.
+
+    A single frame is shown from every pose. Of several, each pose shows the frame that the file says or, if it
+    does not say, each frame is shown from its own pose or a single one. ValueError for other counts, or if the
+    file names other frames.
+    """
+    cameras = path.cameras
     if len(times) == 1:
-        return [(times[0], path[n]) for n in range(len(path))]
-    if len(path) not in (1, len(times)):
+        return [(times[0], cameras[n]) for n in range(len(cameras))]
+    if path.times is not None:
+        others = sorted(set(path.times) - set(times))
+        if others:
+            expected = f"'times' of the path among {len(times)} frames ({times[0]} to {times[-1]})"
+            raise ValueError(
+                f"expected {expected}, got {others[0]}; choose frames with --frames, or a single one for all poses"
+            )
+        return [(time, cameras[n]) for n, time in enumerate(path.times)]
+    if len(cameras) not in (1, len(times)):
         expected = f"one pose or one per frame ({len(times)} frames)"
-        raise ValueError(f"expected {expected}, got {len(path)} poses; choose frames with --frames")
-    return [(time, path[n if len(path) > 1 else 0]) for n, time in enumerate(times)]
+        raise ValueError(f"expected {expected}, got {len(cameras)} poses; choose frames with --frames")
+    return [(time, cameras[n if len(cameras) > 1 else 0]) for n, time in enumerate(times)]

@@ -3,6 +3,7 @@
 import functools
 import logging
 import os
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,6 +19,7 @@ from viewmend.data.camera_reader import CameraReader
 from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.formats import read_any_calibration
+from viewmend.data.formats.files import frame_order
 from viewmend.data.images import read_alpha, uses_alpha
 from viewmend.data.label_masks import LabelMasks
 from viewmend.data.native_format import (
@@ -110,7 +112,8 @@ class CaptureFolder:
         format: str | None = None,
         masks: MaskSource = "files",
     ):
-        calibration = read_any_calibration(path, format)
+        as_read = read_any_calibration(path, format)
+        calibration = with_frames(as_read)
         folder = calibration.folder
         self.folder = folder
         is_file = path.is_file() and path.name != CALIBRATION
@@ -128,9 +131,9 @@ class CaptureFolder:
         self.fps = calibration.fps
         if self.clock is not None:
             self.fps = _choose_fps(calibration.fps, self.clock)
-            calibration = replace(
-                calibration, frames=_ids_in_use(calibration, self._native_cameras, self.clock)
-            )
+            if calibration is not as_read or calibration.file.name != CALIBRATION:
+                frames = _ids_in_use(calibration, self._native_cameras, self.clock)
+                calibration = replace(calibration, frames=frames)
         self._listed = calibration.frames
 
         # With a clock, the frame id at index i stands for the clock's time i; surplus ids are not used
@@ -410,7 +413,7 @@ def _ids_in_use(
 ) -> tuple[str, ...]:
     """The ids of the frames of the videos in use.
 
-    Formats without a list of frames count those of all videos. If some are left out, the others may have more
+    Calibrations without a list of frames count those of all videos. If some are left out, the others may have more
     frames, or fewer.
     """
     listed = calibration.frames
@@ -418,14 +421,34 @@ def _ids_in_use(
     has_numbered_files = any(
         "{frame}" in str(path) for camera in used for path in (camera.image, camera.mask)
     )
-    if (
-        calibration.file.name == CALIBRATION
-        or len(used) == len(calibration.cameras)
-        or has_numbered_files
-        or not is_counted
-    ):
+    if len(used) == len(calibration.cameras) or has_numbered_files or not is_counted:
         return listed
     return tuple(f"{time:06d}" for time in range(clock.end))
+
+
+def with_frames(calibration: NativeCalibration) -> NativeCalibration:
+    """The calibration with the frame ids of its footage if its file lists none.
+
+    They are those of the cameras' numbered images. If all have videos, the frames of these are counted. CaptureError
+    if there are none, or a video cannot be decoded.
+    """
+    if calibration.frames:
+        return calibration
+    ids: set[str] = set()
+    for camera in calibration.cameras:
+        if camera.image is not None:
+            parent, name = os.path.split(camera.image)
+            pattern = re.compile(re.escape(name).replace(re.escape("{frame}"), "(.+)", 1))
+            found = (pattern.fullmatch(file) for file in names_in(calibration.folder / parent))
+            ids |= {match[1] for match in found if match is not None and match.groups()}
+    frames = tuple(sorted(ids, key=frame_order))
+    if all(camera.image is None for camera in calibration.cameras):
+        clock = read_clock(calibration)
+        frames = tuple(f"{time:06d}" for time in range(0 if clock is None else clock.end))
+    if not frames:
+        expected = "'frames', or the cameras' videos or numbered images next to the file"
+        raise CaptureError(f"{calibration.file}: expected {expected}, got neither; put the footage there")
+    return replace(calibration, frames=frames)
 
 
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:

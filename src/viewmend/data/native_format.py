@@ -85,7 +85,7 @@ class _Content(Struct, frozen=True, kw_only=True):
     up: Triple | None = None
     fps: Positive | None = None
     bounds: tuple[Triple, Triple] | None = None
-    frames: Annotated[tuple[Text, ...], Meta(min_length=1)]
+    frames: Annotated[tuple[Text, ...], Meta(min_length=1)] | None = None
     cameras: tuple[_CameraEntry, ...]
 
     def __post_init__(self) -> None:
@@ -99,7 +99,7 @@ class _Content(Struct, frozen=True, kw_only=True):
             raise _invalid(
                 "cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras"
             )
-        _check_names_differ("frames", self.frames)
+        _check_names_differ("frames", self.frames or ())
         _check_names_differ("cameras", [camera.name for camera in self.cameras])
 
 
@@ -151,6 +151,7 @@ class NativeCalibration:
     """The content of a `cameras.json`, with lengths in metres."""
 
     frames: tuple[str, ...]
+    """Frame ids in order; empty if the file lists none, as they are those of the footage (`with_frames`)."""
     cameras: tuple[NativeCamera, ...]
     up: Float64[np.ndarray, "3"] | None
     """Unit length."""
@@ -202,7 +203,7 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
     unit_m = checked.metres_per_unit
     up = None if checked.up is None else np.array(checked.up)
     calibration = NativeCalibration(
-        frames=checked.frames,
+        frames=checked.frames or (),
         cameras=tuple(_camera(entry, shift_px, unit_m) for entry in checked.cameras),
         up=None if up is None else up / np.linalg.norm(up),
         fps=checked.fps,
@@ -290,9 +291,10 @@ def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
         "up": None if calibration.up is None else calibration.up.tolist(),
         "fps": calibration.fps,
         "bounds": None if calibration.bounds_m is None else calibration.bounds_m.tolist(),
-        "frames": list(calibration.frames),
         "cameras": [_entry(camera) for camera in calibration.cameras],
     }
+    if calibration.frames:
+        content["frames"] = list(calibration.frames)
     (folder / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.capture_folder import CaptureFolder, open_capture
+from viewmend.data.capture_folder import CaptureFolder, open_capture, with_frames
 from viewmend.data.containers import container_of
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.native_format import CALIBRATION
@@ -134,7 +134,7 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
 
 def _fingerprint(folder: Path, format: str | None) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
-    plain = read_any_calibration(folder, format)
+    plain = with_frames(read_any_calibration(folder, format))
     folder = plain.folder
     named = {
         c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames

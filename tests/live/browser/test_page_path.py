@@ -166,7 +166,7 @@ def test_a_path_goes_out_as_json_for_mend_and_comes_back(desktop, tmp_path):
     page = desktop.page
     two_views(page)
     path = save_path(desktop, tmp_path)
-    cameras = read_camera_path(path, orbit([0.0], (32, 32)))
+    cameras = read_camera_path(path, orbit([0.0], (32, 32))).cameras
     assert len(cameras) == 61
     start = eye(desktop.server.looks[0]["camera"])
     np.testing.assert_allclose(cameras.centers[0].numpy(), start, atol=1e-4)
