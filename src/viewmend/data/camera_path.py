@@ -78,7 +78,8 @@ def read_camera_path(
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
     with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
     0.5), "width" and "height", "times" (the frame of each pose) and "fps". `origin_m` is the origin of `like`
-    in the coordinates of the capture's files (`origin_of`). Poses that are nearer to it than to 0 are taken to be in those coordinates.
+    in the coordinates of the capture's files (`origin_of`). Poses that are nearer to it than to 0 are taken to
+    be in those coordinates.
     `full_size_px` is the size of the first camera's images if those of `like` are reduced: what the
     file says of intrinsics and size is for unreduced images, and views are reduced if it says no size.
     ValueError if the file has other content.
