@@ -75,14 +75,13 @@ def read_camera_path(
 ) -> CameraPath:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
-    The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object
-    with that list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at
-    0.5), "width" and "height", "times" (the frame of each pose) and "fps". `origin_m` is the origin of `like`
-    in the coordinates of the capture's files (`origin_of`). Poses that are nearer to it than to 0 are taken to
-    be in those coordinates.
-    `full_size_px` is the size of the first camera's images if those of `like` are reduced: what the
-    file says of intrinsics and size is for unreduced images, and views are reduced if it says no size.
-    ValueError if the file has other content.
+    The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object with that
+    list as "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and
+    "height", "times" (the frame of each pose) and "fps". `origin_m` is the origin of `like` in the
+    coordinates of the capture's files (`origin_of`). Poses that are nearer to it than to 0 are taken to be
+    in those coordinates. `full_size_px` is the size of the first camera's images if those of `like` are
+    reduced: what the file says of intrinsics and size is for unreduced images, and views are reduced if it
+    says no size. ValueError if the file has other content.
     """
     try:
         content = read_json(bounded_bytes(file))
@@ -167,9 +166,9 @@ def parse_turntable(text: str) -> Turntable | None:
 def pair_with_frames(path: CameraPath, times: Sequence[int]) -> list[tuple[int, Cameras]]:
     """The frame and the camera of each view of a film of the frames `times`.
 
-    A single frame is shown from every pose. Of several, each pose shows the frame that the file says or, if it
-    does not say, each frame is shown from its own pose or a single one. ValueError for other counts, or if the
-    file names other frames.
+    A single frame is shown from every pose. Of several, each pose shows the frame that the file says or, if
+    it does not say, each frame is shown from its own pose or a single one. ValueError for other counts, or
+    if the file names other frames.
     """
     cameras = path.cameras
     if len(times) == 1:

@@ -413,8 +413,8 @@ def _ids_in_use(
 ) -> tuple[str, ...]:
     """The ids of the frames of the videos in use.
 
-    Calibrations without a list of frames count those of all videos. If some are left out, the others may have more
-    frames, or fewer.
+    Calibrations without a list of frames count those of all videos. If some are left out, the others may
+    have more frames, or fewer.
     """
     listed = calibration.frames
     is_counted = listed == tuple(f"{time:06d}" for time in range(len(listed)))
@@ -429,8 +429,8 @@ def _ids_in_use(
 def with_frames(calibration: NativeCalibration) -> NativeCalibration:
     """The calibration with the frame ids of its footage if its file lists none.
 
-    They are those of the cameras' numbered images. If all have videos, the frames of these are counted. CaptureError
-    if there are none, or a video cannot be decoded.
+    They are those of the cameras' numbered images. If all have videos, the frames of these are counted.
+    CaptureError if there are none, or a video cannot be decoded.
     """
     if calibration.frames:
         return calibration

@@ -142,7 +142,8 @@ def prepare(
     Raises:
         CaptureError: a frame cannot be read, its masks or calibration are unusable, or no
             frame has a subject.
-        ValueError: `inputs` is a string or has an unknown name, or the input cameras look away from each other.
+        ValueError: `inputs` is a string or has an unknown name, or the input cameras look away from each
+        other.
 
     Examples:
         >>> from viewmend import prepare
