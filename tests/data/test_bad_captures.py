@@ -90,7 +90,6 @@ BAD = {
         [FILE, "the key 'K'", "rename"],
     ),
     "typo": (whole(metre_per_unit=0.001), [FILE, "metre_per_unit", "'metres_per_unit'", "rename"]),
-    "no frames": (without("frames"), [FILE, "frames", "expected a value", "got nothing"]),
     "empty frames": (whole(frames=[]), [FILE, "frames", "not empty"]),
     "frame number": (whole(frames=[0, 1]), [FILE, "frames[0]", "a text", "got 0"]),
     "frame twice": (whole(frames=["000", "000"]), [FILE, "frames", "different", "['000'] more than once"]),
