@@ -17,6 +17,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -145,7 +146,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
 
         Masks, or images if there are none, may not have content beyond the cameras' size_px.
         """
-        if isinstance(self.time, Tensor) or not hasattr(self.time, "__index__"):
+        if isinstance(self.time, bool) or not isinstance(self.time, int | np.integer):
             raise ValueError(
                 f"expected time as a whole number, the frame's index, got {self.time!r}; count the frames"
             )

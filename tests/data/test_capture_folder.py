@@ -334,18 +334,26 @@ def test_frames_that_are_not_listed_are_those_of_the_footage(plain):
     plain.save()
     assert open_capture(plain.path).frame_ids == ("000", "001")
     update(plain, image="missing/{frame}.png")
-    with pytest.raises(CaptureError, match="expected 'frames', or the cameras' videos or numbered images"):
+    with pytest.raises(
+        CaptureError, match=r"expected 'frames', or images with a number for \{frame\} in missing/"
+    ):
         open_capture(plain.path)
     for view, name in enumerate("abcd"):
         update(plain, view, image=f"{name}/{{frame}}.png", mask=None)
         for frame in range(3 + (view == 1)):
             plain.put(f"{name}/{frame:04d}.png", np.zeros((32, 40, 3), np.uint8))
+        plain.put(f"{name}/{9:04d}_mask.png", np.zeros((32, 40), np.uint8))
     capture = open_capture(plain.path)
     assert capture.frame_ids == ("0000", "0001", "0002", "0003") and capture.present.sum() == 13
     for view, name in enumerate("abcd"):
         plain.put_video(f"{name}.avi", [np.zeros((32, 40, 3), np.uint8)] * (5 + view))
         update(plain, view, video=f"{name}.avi", image=None)
     assert len(open_capture(plain.path).frame_ids) == 5, "videos end with the shortest"
+    (plain.path / "a.avi").unlink()
+    with pytest.raises(
+        CaptureError, match=r"expected the cameras' videos, as no 'frames' are listed, got no a\.avi"
+    ):
+        open_capture(plain.path)
     assert len(open_capture(plain.path, cameras=["b", "c"]).frame_ids) == 6
 
 

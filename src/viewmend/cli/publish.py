@@ -67,7 +67,7 @@ class Options:
     """Device to compute on: cpu or cuda."""
     geometry: Geometry = "fused"
     """Geometry proxy: the visual 'hull' of the masks, or 'fused', the hull tightened by depth that the
-    model 'views' predicts all around the subject. Fusing adds the time of ten views to each
+    model 'views' predicts all around the subject. Fusing adds 3 to 7 seconds to each
     frame."""
     precision: Precision = "auto"
     """Number format of viewmend's own networks. 'auto' is bfloat16 if the model was

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from msgspec import Meta, Struct
 
-from viewmend.geometry.cameras import Cameras, is_intrinsics
+from viewmend.geometry.cameras import ROUNDING, Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, one_of, read_json, shown, typed
 
@@ -38,7 +38,7 @@ class PathFile(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         poses = torch.tensor(self.world_from_camera)
-        good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
+        good = is_rotation(poses[:, :3, :3]) & ((poses[:, 3] - torch.eye(4)[3]).abs() <= ROUNDING).all(-1)
         if not bool(good.all()):
             pose = int((~good).nonzero()[0])
             expected = "a rotation and translation with the last row 0 0 0 1"

@@ -112,15 +112,16 @@ class CaptureFolder:
         format: str | None = None,
         masks: MaskSource = "files",
     ):
-        as_read = read_any_calibration(path, format)
-        calibration = with_frames(as_read)
+        calibration = read_any_calibration(path, format)
+        chosen = _select(calibration.cameras, cameras, calibration.file)
+        calibration = with_frames(calibration, chosen)
         folder = calibration.folder
         self.folder = folder
         is_file = path.is_file() and path.name != CALIBRATION
         self.name = path.stem if is_file else folder.resolve().name
         """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
-        selected = _with_masks_from(masks, _select(calibration.cameras, cameras, self._file), calibration)
+        selected = _with_masks_from(masks, chosen, calibration)
         self.unmasked = _without_masks(selected)
         """Cameras that are not used, because they have no masks and others do."""
         self._native_cameras = tuple(camera for camera in selected if camera.name not in self.unmasked)
@@ -131,7 +132,7 @@ class CaptureFolder:
         self.fps = calibration.fps
         if self.clock is not None:
             self.fps = _choose_fps(calibration.fps, self.clock)
-            if calibration is not as_read or calibration.file.name != CALIBRATION:
+            if calibration.file.name != CALIBRATION:
                 frames = _ids_in_use(calibration, self._native_cameras, self.clock)
                 calibration = replace(calibration, frames=frames)
         self._listed = calibration.frames
@@ -413,7 +414,7 @@ def _ids_in_use(
 ) -> tuple[str, ...]:
     """The ids of the frames of the videos in use.
 
-    Calibrations without a list of frames count those of all videos. If some are left out, the others may
+    Formats without a list of frames count those of all videos. If some are left out, the others may
     have more frames, or fewer.
     """
     listed = calibration.frames
@@ -426,29 +427,40 @@ def _ids_in_use(
     return tuple(f"{time:06d}" for time in range(clock.end))
 
 
-def with_frames(calibration: NativeCalibration) -> NativeCalibration:
-    """The calibration with the frame ids of its footage if its file lists none.
+def with_frames(calibration: NativeCalibration, cameras: Sequence[NativeCamera]) -> NativeCalibration:
+    """The calibration with the frame ids of these cameras' footage if its file lists none.
 
-    They are those of the cameras' numbered images. If all have videos, the frames of these are counted.
-    CaptureError if there are none, or a video cannot be decoded.
+    They are the numbers in the names of images. If all cameras have videos, the frames of these are counted.
+
+    Raises:
+        CaptureError: no image has a number where the file says, or a video is missing or cannot be decoded.
     """
     if calibration.frames:
         return calibration
-    ids: set[str] = set()
-    for camera in calibration.cameras:
-        if camera.image is not None:
-            parent, name = os.path.split(camera.image)
-            pattern = re.compile(re.escape(name).replace(re.escape("{frame}"), "(.+)", 1))
-            found = (pattern.fullmatch(file) for file in names_in(calibration.folder / parent))
-            ids |= {match[1] for match in found if match is not None and match.groups()}
-    frames = tuple(sorted(ids, key=frame_order))
-    if all(camera.image is None for camera in calibration.cameras):
-        clock = read_clock(calibration)
-        frames = tuple(f"{time:06d}" for time in range(0 if clock is None else clock.end))
-    if not frames:
-        expected = "'frames', or the cameras' videos or numbered images next to the file"
-        raise CaptureError(f"{calibration.file}: expected {expected}, got neither; put the footage there")
-    return replace(calibration, frames=frames)
+    videos = [camera.video for camera in cameras if camera.video is not None]
+    absent = [video for video in videos if not (calibration.folder / video).is_file()]
+    if absent:
+        expected = "the cameras' videos, as no 'frames' are listed"
+        raise CaptureError(f"{calibration.file}: expected {expected}, got no {absent[0]}; put it there")
+    if len(videos) == len(cameras):
+        clock = read_clock(replace(calibration, cameras=tuple(cameras)))
+        assert clock is not None, "there are videos"
+        return replace(calibration, frames=tuple(f"{time:06d}" for time in range(clock.end)))
+    patterns = [camera.image for camera in cameras if camera.image is not None]
+    ids = set[str]().union(*(_numbers_in(calibration.folder, pattern) for pattern in patterns))
+    if not ids:
+        expected = f"'frames', or images with a number for {{frame}} in {patterns[0]}"
+        raise CaptureError(f"{calibration.file}: expected {expected}, got neither; add one of them")
+    return replace(calibration, frames=tuple(sorted(ids, key=frame_order)))
+
+
+def _numbers_in(folder: Path, pattern: str) -> set[str]:
+    """The numbers that stand for {frame} in the names of the files of a pattern; none if a folder has it."""
+    parent, name = os.path.split(pattern)
+    before, _, after = name.partition("{frame}")
+    expression = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
+    matches = (expression.fullmatch(file) for file in names_in(folder / parent))
+    return {match[1] for match in matches if match is not None}
 
 
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:

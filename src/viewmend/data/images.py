@@ -306,7 +306,7 @@ def write_image(path: Path | str, image: UInt8[np.ndarray, "height width *channe
     """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
 
     Raises:
-        ValueError: the suffix is that of no image format, or the image is not of 8 bit.
+        ValueError: the suffix is that of no image format, or the image is not 8-bit.
         OSError: the file cannot be written.
 
     Examples:
@@ -321,17 +321,19 @@ def write_image(path: Path | str, image: UInt8[np.ndarray, "height width *channe
     """
     path = Path(path)
     shape = getattr(image, "shape", ())
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or shape[2:] not in ((), (3,), (4,)):
+    is_image = len(shape) == 2 or (len(shape) == 3 and shape[2] in (1, 3, 4))
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or not is_image:
         got = f"{type(image).__name__} of {getattr(image, 'dtype', 'no type')} and shape {tuple(shape)}"
         raise ValueError(
-            f"expected a numpy array of uint8 and shape (height, width), with 3 or 4 channels last, got {got}; convert "
-            "values in [0, 1] with (255 * image).round().astype(np.uint8)"
+            f"expected a numpy array of uint8 and shape (height, width), with 1, 3 or 4 channels last, got {got}; "
+            "convert values in [0, 1] with (255 * image).round().astype(np.uint8)"
         )
     # No chroma subsampling (4:4:4), which would blur coloured edges.
     jpeg = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
     options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
     swapped = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
-    _write(path, cv2.cvtColor(image, swapped[image.shape[2]]) if image.ndim == 3 else image, options)
+    code = swapped.get(image.shape[-1]) if image.ndim == 3 else None
+    _write(path, image if code is None else cv2.cvtColor(image, code), options)
 
 
 def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> None:

@@ -14,13 +14,16 @@ from viewmend.geometry.rigid import invert_rigid, is_rotation
 from viewmend.utils.tensors import OnDevice, check_tensor
 
 FARTHEST = 1e3
-"""Largest distance of cameras from the origin, relative to the extent of their rig. At that
+"""Largest distance of cameras from the origin, relative to the extent of their rig or `NEAR_RIG_M`. At that
 distance, 32-bit numbers move the image of a point by up to 0.8 pixels, if the focal length is 1500
 pixels and the point is as far from the camera as the rig is wide."""
 
+NEAR_RIG_M = 1.0
+"""Rigs of a smaller extent count as this large, metres: their subject is not nearer because of it."""
+
 ROUNDING = 1e-6
-"""Entries of K and of poses that have to be 0 or 1 may differ from it by this much, the one in the
-second row of K relative to fy: decompositions and products of matrices leave such remainders."""
+"""Entries of K and of the last row of poses that have to be 0 or 1 may differ from that by this much, the
+one in the second row of K relative to fy: decompositions and products of matrices leave such remainders."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ class Cameras(OnDevice):
         centers = self.on_host.centers.detach()
         extent_m = float((centers.amax(0) - centers.amin(0)).amax())
         away_m = float(centers.abs().amax())
-        if extent_m > 0 and away_m > FARTHEST * extent_m:
+        if extent_m > 0 and away_m > FARTHEST * max(extent_m, NEAR_RIG_M):
             raise ValueError(
                 f"expected cameras near the world's origin, got a rig of {extent_m:.3g} m that is {away_m:.3g} m away "
                 "from it, where 32-bit numbers are too coarse; subtract the rig's centre from all positions, in 64 bits"
@@ -249,7 +252,7 @@ def _rows(values: Tensor, index: Sequence[int]) -> Tensor:
 
 
 def check_names(what: str, names: Sequence[str]) -> None:
-    """ValueError if these are a string and no list of names: each of its letters would be taken as one."""
+    """ValueError if these are a string, not a list of names: each of its letters would be taken as one."""
     if isinstance(names, str):
         raise ValueError(f"expected {what} as a list of names, got the string '{names}'; write ['{names}']")
 

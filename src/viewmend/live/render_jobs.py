@@ -221,6 +221,8 @@ class PathJob(RenderJob[bytes]):
         self._times = path.times
         self._frame: MultiViewFrame | None = None
         """The frame of the last view, which is kept because a live rig may drop it before the next view."""
+        self._home: object = None
+        """The home view of the rig that the frame is from."""
         self._count = 0
         self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps, threads=1)  # encodes on the render thread
@@ -237,6 +239,9 @@ class PathJob(RenderJob[bytes]):
         if self._times is None:  # the edge at the start of the job
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
         index = min(self._times[self._count], playback.span.newest)
+        if playback.home is not self._home:  # after a new start, frames of the rig before do not fit
+            self._home = playback.home
+            self._frame = None
         if self._frame is None or self._frame.time != index:
             if index < playback.span.first:
                 raise RenderError(

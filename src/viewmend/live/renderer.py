@@ -92,6 +92,10 @@ class RenderResult:
         return zip(self.completed, self.extra or repeat({}), strict=False)
 
 
+class RequestError(ValueError):
+    """A request names cameras that the rig does not have, or leaves out too many."""
+
+
 class FrameNotReadyError(Exception):
     """The frame has not been read yet."""
 
@@ -270,7 +274,7 @@ class Renderer:
         return self._inpainter.source_names(rendered) if is_predicted else rendered.source_views
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The rig's cameras with these names, in its order; ValueError if fewer than two others are left.
+        """The rig's cameras with these names, in its order; RequestError if fewer than two others are left.
 
         A camera's name that has commas may be divided at them.
         """
@@ -278,7 +282,7 @@ class Renderer:
         listed = f",{','.join(names)},"
         found = tuple(name for name in own if name in names or ("," in name and f",{name}," in listed))
         if names and len(own) - len(found) < 2:
-            raise ValueError(
+            raise RequestError(
                 f"expected two input cameras or more, got {len(own) - len(found)}; leave out fewer"
             )
         return found
@@ -391,10 +395,10 @@ class Renderer:
         return stream.view(camera, None, cached.frame.time, replace(quality, mend=True)).completed
 
     def _true_frame(self, index: int, name: str) -> MultiViewFrame:
-        """A camera's own image; ValueError if the frame has no such camera."""
+        """A camera's own image; RequestError if the frame has no such camera."""
         frame = self._read(index)
         if name not in frame.cameras.names:
-            raise ValueError(
+            raise RequestError(
                 f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got '{name[:40]}'"
             )
         return frame.select([name])

@@ -13,7 +13,7 @@ from viewmend.live.frame_source import FrameSource, Span
 from viewmend.live.poses import HomeView
 from viewmend.live.protocol import FrameTimes
 from viewmend.live.render_jobs import RenderJob
-from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
+from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest, RequestError
 from viewmend.live.sessions import PlaybackState, ShownFrame, ViewerSession
 from viewmend.utils.cancellation import CancelledError, cancellable
 from viewmend.utils.heap import HeapTrimmer
@@ -176,7 +176,7 @@ class RenderService:
             message = f"{type(error).__name__}: {error}"[:400]
             self.counts["errors"] += 1
             session.fail(message)
-            if isinstance(error, ValueError):  # the request is at fault
+            if isinstance(error, RequestError):
                 log.debug("a view that cannot be rendered: %s", message)
             else:
                 log.exception("while rendering a view")

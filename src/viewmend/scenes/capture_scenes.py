@@ -134,7 +134,8 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
 
 def _fingerprint(folder: Path, format: str | None) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
-    plain = with_frames(read_any_calibration(folder, format))
+    plain = read_any_calibration(folder, format)
+    plain = with_frames(plain, plain.cameras)
     folder = plain.folder
     named = {
         c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames

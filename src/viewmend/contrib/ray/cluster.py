@@ -117,7 +117,7 @@ def _evaluate_on_one_core(task: Task, settings: RunSettings, folder: str, weight
     import torch
 
     torch.set_num_threads(1)
-    with suppress(FileNotFoundError):  # another machine, where only absolute paths are valid
+    with suppress(OSError):  # another machine, where only absolute paths work
         os.chdir(folder)
     if weights:
         os.environ[FOLDERS_VARIABLE] = weights

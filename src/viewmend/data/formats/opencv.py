@@ -93,7 +93,7 @@ def _complete_files(place: Path) -> list[Path]:
                 complete.append(path)
         except ValueError:
             invalid.append(path)
-        except OSError:  # unreadable files are none of this format
+        except OSError:  # unreadable files are not of this format
             continue
     return complete or invalid
 
