@@ -117,8 +117,9 @@ def test_invalid_run_lengths_are_rejected(tmp_path, runs, extra):
         read_run_lengths(tmp_path / "a.bin", "a.bin: camera '1'", (3, 4))
 
 
-@pytest.mark.parametrize("image", [IMAGE / 255, IMAGE > 0, IMAGE[..., :1], IMAGE.tolist()])
+@pytest.mark.parametrize("image", [IMAGE / 255, IMAGE > 0, IMAGE[..., :2], IMAGE.tolist()])
 def test_only_images_of_8_bit_are_written(image, tmp_path):
+    write_image(tmp_path / "grey.png", IMAGE[..., :1])
     write_image(str(tmp_path / "right.png"), IMAGE)
     assert np.array_equal(read_rgb(tmp_path / "right.png", "right"), IMAGE)
     unchecked = inspect.unwrap(write_image)  # types are checked in some runs of the tests

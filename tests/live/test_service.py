@@ -10,7 +10,7 @@ from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera, FrameTimes
 from viewmend.live.render_jobs import RenderJob
-from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest, RenderResult
+from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest, RenderResult, RequestError
 from viewmend.live.service import RenderService
 from viewmend.models.base import RenderQuality, State
 from viewmend.utils.cancellation import stop_if_cancelled
@@ -101,7 +101,7 @@ def test_a_failure_is_reported_to_its_session_only(service):
     assert (service.times.encode, service.times.rendering, service.times.total) == (6.0, 12.0, 27.0)
 
 
-@pytest.mark.parametrize(("error", "is_shared"), [(ValueError, False), (MemoryError, True)])
+@pytest.mark.parametrize(("error", "is_shared"), [(RequestError, False), (ValueError, True)])
 def test_an_error_of_one_request_is_not_the_services(service, monkeypatch, error, is_shared):
     def fail(request, viewer):
         raise error("mine")
